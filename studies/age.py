@@ -119,7 +119,7 @@ def file_digest(path: Path) -> str:
 
 @functools.cache
 def code_digest(study: str) -> str:
-    """Of all files that a study depends on."""
+    """Digest of all files that a study depends on."""
     lines = (f"{path.relative_to(TOP)} {file_digest(path)}\n" for path in needed(TOP / "studies" / f"{study}.py"))
     return hashlib.sha256("".join(lines).encode()).hexdigest()[:16]
 

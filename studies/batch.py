@@ -35,7 +35,7 @@ class Options(StudyOptions):
 
     selecting: ClassVar[frozenset[str]] = frozenset({"processes", "only"})
     photos: int = 16
-    """Of the tests' photos, taken evenly from all."""
+    """Number of the tests' photos, taken evenly from all."""
     processes: tuple[int, ...] = (1, 2)
     """Workers that share the photos as it ships."""
     only: tuple[str, ...] = tuple(SETTINGS)
@@ -55,7 +55,7 @@ def batch(listed: Path, out: Path, workers: int, flags: tuple[str, ...]) -> tupl
     return time.perf_counter() - start, used.ru_utime + used.ru_stime, used.ru_maxrss / 2**20
 
 
-def measure(setting: str, workers: int, n: int, device: str) -> Row:
+def measure_setting(setting: str, workers: int, n: int, device: str) -> Row:
     """One setting with so many workers."""
     every = photos_below(PHOTOS)
     with tempfile.TemporaryDirectory() as name:
@@ -83,7 +83,10 @@ def run(options: Options) -> list[Row]:
     cases = {f"{setting}, 1": (setting, 1) for setting in options.only}
     cases |= {f"{first}, {n}": (first, n) for n in options.processes}
     return measured(
-        "batch", {case: (*about, options.photos, options.device) for case, about in cases.items()}, measure, options
+        "batch",
+        {case: (*about, options.photos, options.device) for case, about in cases.items()},
+        measure_setting,
+        options,
     )
 
 

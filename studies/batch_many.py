@@ -31,7 +31,7 @@ from studies.inputs import PHOTOS, photos_below
 from studies.tables import Column, Section, table
 
 SIDE = 256
-"""Of the photos [px]."""
+"""Side of the photos [px]."""
 SMALLEST = ReconstructConfig(size=64, prior="none", unseen="plain", light="keep", steps=0)
 """What takes least and still goes the whole way."""
 BUSY_PHOTO = "palm_open_left_02.png"
@@ -63,7 +63,7 @@ def write_photos(folder: Path, count: int) -> None:
 
 
 def cpu_seconds() -> float:
-    """Of the processes that this one has started and that have ended."""
+    """CPU seconds of the processes that this one has started and that have ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
@@ -131,7 +131,7 @@ def measure_busy(others: int) -> Row:
     }  # fmt: skip
 
 
-def measure(kind: str, *about: int) -> Row:
+def measure_load(kind: str, *about: int) -> Row:
     """A case."""
     return measure_many(*about) if kind == "many" else measure_busy(*about)
 
@@ -140,7 +140,7 @@ def run(options: Options) -> list[Row]:
     """All numbers of processes, then all numbers of busy ones."""
     cases: dict[str, tuple] = {f"{options.photos} photos, {n}": ("many", options.photos, n) for n in options.processes}
     cases |= {f"{n} others": ("busy", n) for n in options.others}
-    return measured("batch_many", cases, measure, options)
+    return measured("batch_many", cases, measure_load, options)
 
 
 MANY = (

@@ -23,7 +23,7 @@ class Options(StudyOptions):
     """Options of this study."""
 
     scenes: int = 5000
-    """Of the grid."""
+    """Scenes of the grid."""
 
 
 def run(options: Options) -> list[Row]:

@@ -38,9 +38,9 @@ class Options(StudyOptions):
 
     selecting: ClassVar[frozenset[str]] = frozenset({"kinds"})
     photos: int = 10_016
-    """Of the tree; a multiple of the 32 that are drawn."""
+    """Photos of the tree; a multiple of the 32 that are drawn."""
     processes: tuple[int, ...] = (0, 1, 2)
-    """That load; 0 is a thread of the training."""
+    """Processes that load; 0 is a thread of the training."""
     kinds: tuple[Literal["files", "tar"], ...] = ("files", "tar")
     """As single files or in one tar file."""
     seconds: float = 10.0
@@ -63,7 +63,7 @@ def write_tree(root: Path, photos: int, packed: bool) -> Path:
     return mano
 
 
-def measure(kind: str, photos: int, processes: tuple[int, ...], seconds: float) -> list[Row]:
+def measure_readers(kind: str, photos: int, processes: tuple[int, ...], seconds: float) -> list[Row]:
     """A row for each number of processes."""
     rows, size = [], HANDS * (1 + VIEWS)
     with tempfile.TemporaryDirectory() as name:
@@ -100,7 +100,7 @@ def run(options: Options) -> list[Row]:
     if options.photos % 32:
         raise InputError(f"--photos: expected a multiple of 32, got {options.photos}.")
     about = options.photos, options.processes, options.seconds
-    return measured("data_loading", {kind: (kind, *about) for kind in options.kinds}, measure, options)
+    return measured("data_loading", {kind: (kind, *about) for kind in options.kinds}, measure_readers, options)
 
 
 SECTIONS = (

@@ -59,7 +59,7 @@ class Options(StudyOptions):
     people: int = 32
     """Each shows PHOTOS_EACH photos."""
     seed: int = 77
-    """Of a world that training does not use."""
+    """Seed of a world that training does not use."""
 
 
 def errors(said: DensePrediction, true: DenseBatch, k: int) -> Row | None:
@@ -102,7 +102,7 @@ def _linear(srgb: Tensor) -> Tensor:
 
 
 @torch.inference_mode()
-def measure(network: DenseNetwork, options: Options, number: int) -> list[Row]:
+def measure_person(network: DenseNetwork, options: Options, number: int) -> list[Row]:
     """Rows of one rendering: two people, with landmarks as a detector finds them, and without."""
     photos = DensePhotos(seed=options.seed, people=options.people, hands=2, size=256, device=torch.device("cpu"))
     scene, random = SceneConfig(people=options.people), torch.Generator().manual_seed(number)
@@ -126,7 +126,7 @@ def run(options: Options) -> list[Row]:
         network = load_dense_network(options.weights or bundled)
     numbers = range(options.people * PHOTOS_EACH // 2)
     cases = {f"rendering {number}": (network, options, number) for number in numbers}
-    return measured("dense_network", cases, measure, options)
+    return measured("dense_network", cases, measure_person, options)
 
 
 def held_out(rows: list[Row]) -> str | None:

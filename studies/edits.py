@@ -77,7 +77,7 @@ def known_hand(side: str, size: int, prior: str, steps: int | None) -> KnownHand
     return make_truth(bundled_hand(), prior_named(prior), back=side == "back", size=size, steps=steps)
 
 
-def measure(side: str, drawing: str, options: Options) -> Iterator[Row]:
+def measure_edit(side: str, drawing: str, options: Options) -> Iterator[Row]:
     """A row for the photo's view and each other view."""
     known = known_hand(side, options.size, options.prior, options.steps)
     chart = Chart(known, drawing)
@@ -101,7 +101,7 @@ def run(options: Options) -> list[Row]:
         for side in ("palm", "back") for drawing in options.drawings
         if (drawing, side) != ("nail polish", "palm")  # where no nails show
     }  # fmt: skip
-    return measured("edits", cases, measure, options)
+    return measured("edits", cases, measure_edit, options)
 
 
 def lines(rows: list[Row]) -> list[Row]:

@@ -46,7 +46,7 @@ from studies.tables import Section, markdown, percentiles
 CROP = 256
 """Side of the crop whose pixels errors are given in [px]."""
 MARGIN = 0.0015
-"""Of visibility, as the network sees it [m]."""
+"""Margin of visibility, as the network sees it [m]."""
 PARTS = ("angles", "orientation", "translation", "shape", "K")
 FILES = ("estimator_errors/tables.json",)
 OUTCOMES = {
@@ -68,7 +68,7 @@ class Options(StudyOptions):
     each: int = 2
     """Pictures of each person."""
     seed: int = 7001
-    """Of a world that is not the training's."""
+    """Seed of a world that training does not use."""
     size: int = 384
     """Side of the pictures [px]."""
     asset: Path | None = None
@@ -87,7 +87,7 @@ def mirrored(values: Arrays, width: int) -> Arrays:
     return values | {"orientation": orientation, "translation": mirror * values["translation"], "K": K}
 
 
-def measure(number: int, options: Options) -> Row:
+def measure_estimate(number: int, options: Options) -> Row:
     """Estimate one picture; writes what is true and what was found."""
     index = PICTURES_EACH * (number // options.each) + number % options.each
     batch = render_batch(options.seed, [index], options.size)
@@ -96,7 +96,7 @@ def measure(number: int, options: Options) -> Row:
 
 
 def estimate_picture(batch: SyntheticBatch, number: int, index: int, options: Options) -> Row:
-    """`measure`, but for the person."""
+    """`measure_estimate`, but for the person."""
     size = options.size
     side = "left" if int(batch.left[0]) else "right"
     photo = synthetic_photo(batch.image[0], f"picture {index}")
@@ -223,7 +223,7 @@ class Surfaces:
 
 
 def iou(a: Tensor, b: Tensor) -> Tensor:
-    """Of each pair of masks."""
+    """Intersection over union of each pair of masks."""
     return (a & b).flatten(1).sum(1) / (a | b).flatten(1).sum(1)
 
 
@@ -334,7 +334,7 @@ def text(every: list[Row], rows: list[Arrays], options: Options) -> str:
 def run(options: Options) -> list[Row]:
     """Estimate what is missing, and write the text of the section."""
     numbers = range(options.first, options.first + options.count)
-    measured("estimator_errors", {f"picture {k}": (k, options) for k in numbers}, measure, options)
+    measured("estimator_errors", {f"picture {k}": (k, options) for k in numbers}, measure_estimate, options)
     folder = options.out / "estimator_errors"
     every, rows = read_rows(folder / ROWS), []
     for row in every:

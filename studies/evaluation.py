@@ -37,7 +37,7 @@ PICTURES = {"evaluation_sheet": "evaluation/sheet.png", "evaluation_attention": 
             "same_hand_sheet": "same_hand_photos/sheet.png"}  # fmt: skip
 """Pictures of docs/_static and where they come from."""
 ROWS_SHOWN = 1300
-"""Of a picture [px]."""
+"""Rows of a picture that are shown [px]."""
 
 @dataclass(frozen=True, kw_only=True)
 class Options(StudyOptions):

@@ -62,7 +62,7 @@ class Options(StudyOptions):
     repeats: int = 3
     """Times that each file is written; the median counts."""
     seed: int = 0
-    """Of the random poses."""
+    """Seed of the random poses."""
 
 
 def the_avatar(options: Options) -> Avatar:
@@ -172,7 +172,7 @@ def texture_psnr(avatar: Avatar, size: int) -> float:
     return worst
 
 
-def measure(ending: str, options: Options) -> Iterator[Row]:
+def measure_format(ending: str, options: Options) -> Iterator[Row]:
     """The row of one format."""
     if ending in OTHERS:
         with TemporaryDirectory() as name:
@@ -184,7 +184,7 @@ def measure(ending: str, options: Options) -> Iterator[Row]:
 def run(options: Options) -> list[Row]:
     """Measure every format that needs no further package."""
     endings = [*READERS, *MESHES, *OTHERS]
-    return measured("exports", {ending: (ending, options) for ending in endings}, measure, options)
+    return measured("exports", {ending: (ending, options) for ending in endings}, measure_format, options)
 
 
 COMMON = (

@@ -72,7 +72,7 @@ class Fitted(NamedTuple):
 
     fit: HandFit
     offsets: Tensor
-    """Of the vertices at rest, onto the outline [m]."""
+    """Offsets of the vertices at rest, onto the outline [m]."""
 
     def surface(self, moved: bool) -> tuple[PosedHand, PosedHand]:
         """At rest, and in the photo; `moved` onto the outline, or as the model has it."""
@@ -138,7 +138,7 @@ def measure_photo(photo: Photo, kind: str, true: Tensor | None = None, side: str
         yield row
 
 
-def measure(path: Path, drawn: Path) -> list[Row]:
+def measure_real(path: Path, drawn: Path) -> list[Row]:
     """The hands of a real photo."""
     mask = read_masks(drawn).get(path.stem) if "same_hand" not in path.parts else None
     return list(measure_photo(read_photo(path), "real", None if mask is None else torch.from_numpy(mask) > 0.5))
@@ -172,7 +172,7 @@ def run(options: Options) -> list[Row]:
     paths, rows = photos_below(options.photos), []
     if "fit" in options.parts:
         cases = {str(path.relative_to(options.photos)): (path, options.drawn) for path in paths}
-        rows += measured("fit", cases, measure, options)
+        rows += measured("fit", cases, measure_real, options)
     if "faults" in options.parts:
         some = paths[:: options.every]
         cases = {
@@ -187,7 +187,7 @@ def run(options: Options) -> list[Row]:
 
 
 def shares(rows: list[Row]) -> list[Row]:
-    """Of each fault, the share of fits with a warning of each kind."""
+    """Share of fits with a warning of each kind, for each fault."""
     found = []
     for (name,), own in groups([row for row in rows if "fault" in row], "fault").items():
         warned = {

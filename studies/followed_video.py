@@ -66,7 +66,7 @@ def write_film(path: Path, avatar: Avatar, poses: list[HandPose], options: Optio
 
 
 @torch.no_grad()
-def measure(clip: str, options: Options) -> Iterator[Row]:
+def measure_clip(clip: str, options: Options) -> Iterator[Row]:
     """Rows of the truth, of each frame alone, and after the filter."""
     avatar = exports.the_avatar(options)
     poses = poses_of(avatar, CLIPS[clip], options)
@@ -97,7 +97,7 @@ def against(true: Float[Tensor, "T 21 3"], motion: Motion, points) -> Row:
 
 def run(options: Options) -> list[Row]:
     """Follow the hand of each film."""
-    return measured("followed_video", {clip: (clip, options) for clip in CLIPS}, measure, options)
+    return measured("followed_video", {clip: (clip, options) for clip in CLIPS}, measure_clip, options)
 
 
 SECTIONS = (

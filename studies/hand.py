@@ -20,7 +20,7 @@ from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import HandPose, PosedHand
 from oasis_warp.data.pictures import write_picture
-from oasis_warp.hand.contact import giving_way
+from oasis_warp.hand.contact import resolve_contact
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import bundled_hand
@@ -31,10 +31,10 @@ from studies.tables import Column, Section, groups, table
 FACING = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 """Fingers up, palm to the camera."""
 AZIMUTHS = (0.0, math.pi, math.pi / 2, math.pi / 5)
-"""Of the views: palm, back, the thumb's side and between [rad]."""
+"""Azimuths of the views: palm, back, the thumb's side and between [rad]."""
 CORRECTED_POSES = ("fist", "thumbs_up", "pinch", "ok", "open")
 WIDTH = 1500
-"""Of the pictures [px]."""
+"""Width of the pictures [px]."""
 GESTURES = "gestures"
 
 
@@ -43,7 +43,7 @@ class Options(StudyOptions):
     """Options of this study."""
 
     hands: int = 20
-    """Of random shape, beside the mean hand: each coefficient has a standard deviation of 1."""
+    """Hands of random shape, beside the mean hand: each coefficient has a standard deviation of 1."""
     gestures: int = 24
     """Sampled beside the named poses, their parts pushed apart on the mean hand's joints."""
     seed: int = 11
@@ -60,7 +60,7 @@ def without_correctives(hand: HandModel) -> HandModel:
     return dataclasses.replace(hand, corrective_basis=hand.corrective_basis[..., :0])
 
 
-def measure(pose: str, gesture: torch.Tensor | None, shapes: torch.Tensor) -> Iterator[Row]:
+def measure_pose(pose: str, gesture: torch.Tensor | None, shapes: torch.Tensor) -> Iterator[Row]:
     """A row for each hand in a named pose or a gesture, the mean one first.
 
     Crossing edges, volume [cm^3] and the largest shift [mm].
@@ -70,7 +70,7 @@ def measure(pose: str, gesture: torch.Tensor | None, shapes: torch.Tensor) -> It
     for number, shape in enumerate(shapes):
         angles = named_pose(hand, pose, rest_hand(hand, shape)) if gesture is None else gesture
         surfaces = {"skinned": posed(hand, angles, shape).vertices}
-        surfaces["contact"] = giving_way(hand, surfaces["skinned"])
+        surfaces["contact"] = resolve_contact(hand, surfaces["skinned"])
         if number == 0:
             surfaces["plain"] = posed(without_correctives(hand), angles, shape).vertices
         row: Row = {"pose": pose, "hand": number}
@@ -92,7 +92,7 @@ def run(options: Options) -> list[Row]:
     shapes = torch.cat([torch.zeros_like(shapes[:1]), shapes])
     cases: dict[str, tuple] = {name: (name, None, shapes) for name in POSE_NAMES}
     cases |= {f"{GESTURES} {k}": (GESTURES, torch.from_numpy(own[1:]), shapes) for k, own in enumerate(apart)}
-    return measured("hand", cases, measure, options)
+    return measured("hand", cases, measure_pose, options)
 
 
 def lines(rows: list[Row]) -> list[Row]:
@@ -132,7 +132,7 @@ def draw(rows: list[Row], static: Path) -> None:
     for name in POSE_NAMES:
         angles = named_pose(hand, name)
         plain, full = (posed(model, angles, mean_hand) for model in (without_correctives(hand), hand))
-        full = full._replace(vertices=giving_way(hand, full.vertices))
+        full = full._replace(vertices=resolve_contact(hand, full.vertices))
         strips.append(views(full, name, side))
         if name in CORRECTED_POSES:
             pairs.append(views(plain, f"{name}, before", side) + views(full, "after", side))

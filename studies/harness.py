@@ -67,7 +67,7 @@ class AvatarOptions(StudyOptions):
     prior: str = "learned"
     """learned, none or a weights file."""
     steps: int | None = None
-    """Of texture learning; by default until its loss is flat."""
+    """Steps of texture learning; by default until its loss is flat."""
 
     def config(self, **changes: Any) -> ReconstructConfig:
         """Options of `reconstruct`."""
@@ -93,10 +93,10 @@ def measured(
     """Measure the cases that have no rows yet, keep each as it comes, and return the rows of all.
 
     Args:
-        name: Of the study, and of the folder that rows are kept in.
+        name: Name of the study, and of the folder that rows are kept in.
         cases: Arguments of `measure` by the name of the case.
         measure: Returns the rows of one case; a function of a module, so that other processes find it.
-        options: Of the study.
+        options: Options of the study.
 
     Raises:
         InputError: the folder cannot be used, or holds rows made with other settings.

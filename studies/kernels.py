@@ -46,7 +46,7 @@ class Options(StudyOptions):
     """Options of this study."""
 
     parts: tuple[Literal["kernels", "scaling", "roofline"], ...] = ("kernels", "scaling", "roofline")
-    """Of the GPU's."""
+    """Parts of the GPU's measurements."""
 
 
 def measure_part(part: str, options: Options) -> Sequence[Any]:

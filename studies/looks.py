@@ -31,7 +31,7 @@ SHOWN = {
 }  # fmt: skip
 """Pictures of docs/_static and the photos whose sheets they are."""
 WIDTH, QUALITY = 1800, 85
-"""Of these pictures [px], and of their JPEG: 100 to 250 KB each."""
+"""Width of these pictures [px], and quality of their JPEG: 100 to 250 KB each."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -37,7 +37,7 @@ SAMPLES = 4
 MELANIN = 0.03
 GROUND = (0.32, 0.42, 0.38)
 WAVES, WAVE_LENGTHS, WAVE_SIZE = 24, (0.002, 0.02), 0.006
-"""Of the skin's own detail: how many, how long [m] and how strong [sRGB]."""
+"""Waves of the skin's own detail: how many, how long [m] and how strong [sRGB]."""
 RING_FINGER, RING_PLACE, RING_WIDTH = 10, 0.55, 0.006
 """Joint, share of the bone and width [m]."""
 GOLD, DARK_GOLD, POLISH = (0.86, 0.66, 0.2), (0.45, 0.3, 0.06), (0.75, 0.05, 0.2)
@@ -61,7 +61,7 @@ class KnownHand(NamedTuple):
     """LitGaussians from the photo without paint, on the true surface."""
     photo: Photo
     waves: tuple[Tensor, Tensor, Tensor] | None
-    """Of the skin's detail; None where it is not known."""
+    """Waves of the skin's detail; None where it is not known."""
 
 
 class Drawn(NamedTuple):

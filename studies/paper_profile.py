@@ -34,7 +34,7 @@ from studies.tables import Column, Section, table
 PEOPLE, VIEWS = 4, 4
 """Synthetic people that are learned by heart, and targets of a photo, which are the paper's."""
 PHOTOS = 1_000_000
-"""That the cost of a training is told for: the paper names neither its steps nor its batch."""
+"""Number of photos that the cost of a training is told for: the paper names neither its steps nor its batch."""
 SPREAD = 0.02
 """Standard deviation of random positions and of the weights of random LPIPS layers, as transformers start with."""
 SHOWN = (0, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
@@ -212,7 +212,7 @@ def measure_adaptation(profile: str, network: HandNetwork, batch: TrainingBatch,
     }  # fmt: skip
 
 
-def measure(what: str, options: Options, *about: object) -> list[Row] | Row:
+def measure_profile(what: str, options: Options, *about: object) -> list[Row] | Row:
     """A case."""
     functions: dict[str, Callable[..., list[Row] | Row]] = {"cost": measure_cost, "curve": measure_curve}
     return functions[what](*about, options)
@@ -227,7 +227,7 @@ def run(options: Options) -> list[Row]:
             if profile == "paper":
                 cases[f"{profile}, {hands}, LPIPS"] = ("cost", options, profile, hands, True)
         cases[f"{profile}, curve"] = ("curve", options, profile)
-    return measured("paper_profile", cases, measure, options)
+    return measured("paper_profile", cases, measure_profile, options)
 
 
 # ---- tables

@@ -72,8 +72,8 @@ def ablation_rows(
     """A row for each variant: means, and how they differ from those of the variant `whole`, with errors over people.
 
     Args:
-        records: Of single pictures.
-        light: Of photos and targets.
+        records: Records of single pictures.
+        light: Light of photos and targets.
         colors: "raw", or "matched" to the target.
         stage: How far avatars were adapted.
         variants: Title, and method in the records, by name.
@@ -134,7 +134,7 @@ def _cell(row: Row, measure: str, column: Measure) -> str:
 # ---- adaptation
 
 
-def measure(name: str, prior: NetworkPrior, options: Options) -> list[Record]:
+def evaluate_without(name: str, prior: NetworkPrior, options: Options) -> list[Record]:
     """The pictures' records of one setting; its methods are called after it, or "prior" for that of the mean hand."""
     priors: dict[str, Any] = {"learned": prior, **({"mean": MeanPrior(bundled_hand())} if name == FULL else {})}
     config = SyntheticEvaluation(
@@ -156,7 +156,7 @@ def run(options: Options) -> list[Row]:
     prior = choose_prior(prior_choice(options.prior))
     if not isinstance(prior, NetworkPrior):
         raise SystemExit("--prior: expected a network.")
-    records = [record for name in ADAPTATIONS for record in measure(name, prior, options)]
+    records = [record for name in ADAPTATIONS for record in evaluate_without(name, prior, options)]
     variants = {name: (title, Method(name, ONE_SHOT)) for name, title in TITLES.items()}
     settings = {"people": options.people, "prior": options.prior}
     rows = [

@@ -49,7 +49,7 @@ class Options(StudyOptions):
     """Side of the crop [px]; that of the photo by default."""
 
 
-def measure(path: Path, prior: str, options: Options) -> Row:
+def measure_avatar(path: Path, prior: str, options: Options) -> Row:
     """One photo's row; writes its avatar."""
     start = time.perf_counter()
     config = ReconstructConfig(
@@ -76,7 +76,7 @@ def run(options: Options) -> list[Row]:
     """Measure every photo with every prior."""
     paths = [path for folder in options.folders for path in photos_in(folder) or photos_below(folder)]
     cases = {f"{path}, {prior}": (path, prior, options) for prior in options.priors for path in paths}
-    return measured("photos", cases, measure, options)
+    return measured("photos", cases, measure_avatar, options)
 
 
 # ---- tables

@@ -26,7 +26,7 @@ class Options(StudyOptions):
     """Folder of photos; those of a subfolder show one hand."""
 
 
-def measure(path: Path, hand: str) -> Row:
+def measure_contrast(path: Path, hand: str) -> Row:
     """One photo's row."""
     found = measure_real(read_photo(path), estimator())
     return {"hand": hand, "photo": path.name, **{name: found[name] for name in ("crop_px", "contrast", "darkest")}}
@@ -35,7 +35,7 @@ def measure(path: Path, hand: str) -> Row:
 def run(options: Options) -> list[Row]:
     """Measure every photo and write the table that ships."""
     cases = {f"{hand}/{path.name}": (path, hand) for path, hand in real_photos(options.photos).items()}
-    rows = measured("real_hands", cases, measure, options)
+    rows = measured("real_hands", cases, measure_contrast, options)
     write_file(TABLE, (json.dumps(summarise_real(complete(rows)), indent=1) + "\n").encode())
     return rows
 

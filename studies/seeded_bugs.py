@@ -139,15 +139,18 @@ PIPELINE = [
     _of("ops/_runtime/blend_tiles", "certify/test_grid", "small_scenes and rasterization", "farthest first",
         "torch.argsort(depths.view(-1)[drawn], stable=True)", "torch.argsort(-depths.view(-1)[drawn], stable=True)"),
 ]  # fmt: skip
+STOPS = f"\n{28 * ' '}transmittance[pixel] = -before\n{28 * ' '}stops[pixel] = place"
+PIXEL = f"\n{20 * ' '}pixel = (camera * height + y) * width + x"
+"""Lines of `blend` that tell it from `weigh` in the same file."""
 
 BUGS = [
     *PIPELINE,
     *_in(
         "rasterize/rasterize_forward.py", "rasterization",
         ("pixel centre without 0.5", "type(whole)(0.5) - remainder", "type(whole)(0.0) - remainder"),
-        ("the stop draws the last layer", "if after <= scalar(stop):", "if before <= scalar(stop):"),
-        ("no stop", "if after <= scalar(stop):", "if after < scalar(0.0):"),
-        ("no cap", "alpha = wp.min(raw, scalar(constants.ALPHA_MAX))", "alpha = wp.min(raw, scalar(1.0))"),
+        ("the stop draws the last layer", f"if after <= scalar(stop):{STOPS}", f"if before <= scalar(stop):{STOPS}"),
+        ("no stop", f"if after <= scalar(stop):{STOPS}", f"if after < scalar(0.0):{STOPS}"),
+        ("no cap", f"wp.min(raw, scalar(constants.ALPHA_MAX)){PIXEL}", f"wp.min(raw, scalar(1.0)){PIXEL}"),
     ),
     *_in(
         "rasterize/rasterize_backward.py", "rasterization",

@@ -42,7 +42,7 @@ Rows = Iterator[list[Panel]]
 FINER = 3
 """Avatars are drawn so many times as large and averaged."""
 AZIMUTHS = (90, 180)
-"""Of the views beside the photo's own [degrees]."""
+"""Azimuths of the views beside the photo's own [degrees]."""
 FUSED = tuple(
     SAME_HAND / "a1_wood_right" / f"{stem}.jpg" for stem in ("02_flat_closed", "03_flat_closed_back", "05_c_shape_open")
 )
@@ -209,7 +209,7 @@ class Sheet(NamedTuple):
 
     rows: Callable[[ReconstructConfig, int], Rows]
     width: int
-    """Of the picture [px]."""
+    """Width of the picture [px]."""
     title: str
     subtitle: str = ""
 

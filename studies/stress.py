@@ -167,7 +167,7 @@ class FaultyInput(NamedTuple):
     photo: Photo
     landmarks: Landmarks
     other: Landmarks
-    """Of another photo."""
+    """Landmarks of another photo."""
     mask: np.ndarray
     """The right mask of this one."""
     rng: np.random.Generator
@@ -271,7 +271,7 @@ def likeness(avatar: Avatar, other: Avatar) -> float:
     return masked_psnr(match_colors(others, images, inside.float()), images, inside.float())
 
 
-def measure(name: str, config: ReconstructConfig) -> list[Row]:
+def measure_refusals(name: str, config: ReconstructConfig) -> list[Row]:
     """A row for the photo as it is and one for each damage."""
     photo = photo_named(name, device=config.device)
     base = reconstruct(photo, config)
@@ -304,7 +304,7 @@ def row_of(name: str, damage: str, made: Reconstruction, base: Reconstruction, r
 
 def run(options: Options) -> list[Row]:
     """Damage every photo."""
-    return measured("stress", {name: (name, options.config()) for name in options.photos}, measure, options)
+    return measured("stress", {name: (name, options.config()) for name in options.photos}, measure_refusals, options)
 
 
 def warnings_of(row: Row) -> str:

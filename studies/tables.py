@@ -26,7 +26,7 @@ class Column(NamedTuple):
     value: str | Callable[[Row], Any]
     """A key of the rows, or a function of one."""
     form: str | Callable[[Any], str] = ""
-    """Of its numbers: as `format` takes it, or a function such as `short`."""
+    """Format of its numbers: as `format` takes it, or a function such as `short`."""
 
     def cell(self, row: Row) -> str:
         """The text of one row; empty where it has no value."""

@@ -43,7 +43,7 @@ def wait(device: str) -> None:
         torch.cuda.synchronize()
 
 
-def measure(options: Options) -> list[Row]:
+def measure_stages(options: Options) -> list[Row]:
     """Each stage and all together, the fastest of the repeats."""
     # One thread is timed by its own clock: other work on the machine does not count then.
     clock = time.thread_time if options.device == "cpu" and options.threads == 1 else time.perf_counter
@@ -90,7 +90,7 @@ def measure(options: Options) -> list[Row]:
 
 def run(options: Options) -> list[Row]:
     """Time the stages on the device."""
-    return measured("timing", {f"pictures on {options.device}": (options,)}, measure, options)
+    return measured("timing", {f"pictures on {options.device}": (options,)}, measure_stages, options)
 
 
 COLUMNS = Column("stage", "stage"), Column("ms a picture", "ms", ".3g")

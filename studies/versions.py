@@ -45,7 +45,7 @@ def others() -> list[str]:
     return [line for line in needed if Requirement(line).name != "torch"]
 
 
-def measure(python: str, torch: str) -> Row:
+def measure_versions(python: str, torch: str) -> Row:
     """Install, look, make an avatar and run tests; a step that fails is told by a line of its own, and ends the case.
 
     What `oasis doctor` finds ends nothing: it refuses versions outside our bounds.
@@ -96,7 +96,7 @@ def run(options: Options) -> list[Row]:
     """Try every pair of versions."""
     cases = {f"Python {python}, torch {torch}": (python, torch)
              for torch in options.torches for python in options.pythons}  # fmt: skip
-    return measured("versions", cases, measure, options)
+    return measured("versions", cases, measure_versions, options)
 
 
 COLUMNS = (

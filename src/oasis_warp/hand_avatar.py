@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.avatar.pose import GAMMA, SurfaceLight, hidden_by_hand, in_even_light, pose_gaussians, with_photo
+from oasis_warp.avatar.pose import GAMMA, SurfaceLight, in_even_light, pose_gaussians, with_photo, with_self_occlusion
 from oasis_warp.core.color import plain_background
 from oasis_warp.core.config import BLACK, WHITE
 from oasis_warp.core.hand_model import MANO_SHAPES, HandModel
@@ -33,7 +33,7 @@ from oasis_warp.core.types import (
     Side,
 )
 from oasis_warp.data.avatar_file import LIGHT_HIDDEN, load_avatar, save_avatar
-from oasis_warp.hand.contact import giving_way
+from oasis_warp.hand.contact import resolve_contact
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin, skin_surface
 from oasis_warp.hand.template import bundled_hand, chosen_hand
@@ -161,15 +161,15 @@ class Avatar:
             check_finite(angles=pose.angles, orientation=pose.orientation, translation=pose.translation)
         return HandPose(*(part.to(self.shape) for part in pose))
 
-    def _giving_way(self, vertices: Float[Tensor, "*B V 3"], pose: HandPose) -> Float[Tensor, "*B V 3"]:
+    def _resolve_contact(self, vertices: Float[Tensor, "*B V 3"], pose: HandPose) -> Float[Tensor, "*B V 3"]:
         """Posed vertices after contact: nothing gives way in the photo's pose, whose colours were learned there."""
         bent = (pose.angles.detach() - self._source_angles).abs().amax((-2, -1))
-        return giving_way(self.hand, vertices, self.side, bent)
+        return resolve_contact(self.hand, vertices, self.side, bent)
 
     def mesh(self, pose: HandPose | str, *, validate: bool = True) -> PosedHand:
         """The surface that carries Gaussians, in `pose` [m]; the faces of a left hand wind the other way.
 
-        Fingers and palm give way to each other where they touch, as in `hand.contact.giving_way`: a constant to
+        Fingers and palm give way to each other where they touch, as in `hand.contact.resolve_contact`: a constant to
         derivatives. In the photo's pose they do not, and more and more up to `hand.contact.FREE` away from it.
 
         Args:
@@ -182,7 +182,7 @@ class Avatar:
         """
         pose = self._checked(pose, validate)
         posed = skin(self._model, self._rest, pose)
-        return posed._replace(vertices=self._giving_way(posed.vertices, pose))
+        return posed._replace(vertices=self._resolve_contact(posed.vertices, pose))
 
     def pose(self, pose: HandPose | str, *, validate: bool = True) -> Gaussians:
         """The Gaussians in `pose`, in the world of its orientation and translation, where its light stays too.
@@ -197,7 +197,7 @@ class Avatar:
             ValueError: a part of the pose has another shape or is not finite, or no pose has that name.
         """
         checked = self._checked(pose, validate)
-        posed = self._giving_way(skin_surface(self._model, self._rest, checked), checked)
+        posed = self._resolve_contact(skin_surface(self._model, self._rest, checked), checked)
         return pose_gaussians(self._canonical, self.hand.faces, self._rest_mesh, posed, self._light)
 
     def render(
@@ -258,7 +258,7 @@ class Avatar:
         The photo's shade stays where skin faces as in the photo. Light that is part of the colours stays too.
 
         Args:
-            harmonics: Of `avatar.sky.environment_light` or `studio_light`, in the world of the photo's camera.
+            harmonics: Result of `avatar.sky.environment_light` or `studio_light`, in the photo's camera's world.
         """
         level = self.shape.new_ones(3) if self.light is None else self.light.even
         around = harmonics.to(level) * level.mean()
@@ -347,11 +347,11 @@ class Avatar:
 
     @torch.no_grad()
     def _with_hidden_light(self) -> "Avatar":
-        """An avatar of an older file version, whose light ignored self-occlusion; the photo's own view stays."""
+        """An avatar of an older file version: its light ignored self-occlusion. The photo's own view stays."""
         if self.light is None:
             return self
         albedo = self._mean_albedo(self.light.even)
-        light = hidden_by_hand(self.light, albedo, self.rest.vertices, self._photo_surface(), self.hand.faces)
+        light = with_self_occlusion(self.light, albedo, self.rest.vertices, self._photo_surface(), self.hand.faces)
         return self.with_looks(self.gaussians, light)
 
 

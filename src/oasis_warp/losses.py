@@ -69,7 +69,7 @@ class SsimTarget(NamedTuple):
 
 
 def ssim_target(image: Float[Tensor, "H W 3"]) -> SsimTarget:
-    """`image` with what `ssim_map` needs of it."""
+    """`image` with its own statistics, which `ssim_map` needs."""
     y = image.permute(2, 0, 1)
     return SsimTarget(image, *_blur(torch.cat([y, y * y])).split(3))
 
@@ -107,8 +107,8 @@ def detail_difference(
 ) -> Float[Tensor, "N"]:
     """Mean absolute difference of the images' gradients inside the masks, summed over scales.
 
-    Blur and lost lines cost here what a mean of colour differences hardly notices. The place of LPIPS where its
-    weights are not at hand.
+    It penalises blur and lost lines, which a mean colour difference hardly notices. It takes the place of LPIPS where
+    the weights of LPIPS are not available.
     """
     error = ((images - targets) * masks[..., None]).permute(0, 3, 1, 2)
     weight, total = masks[:, None], images.new_zeros(len(images))
@@ -124,7 +124,7 @@ class Layer(NamedTuple):
     """A convolution of a trunk, with what comes before and after it."""
 
     place: int
-    """Of the convolution in torchvision's `features`."""
+    """Place of the convolution in torchvision's `features`."""
     channels: int
     kernel: int
     stride: int
@@ -153,7 +153,7 @@ LAYERS: dict[Trunk, tuple[Layer, ...]] = {
 POOLING = {"alex": (3, 2), "vgg": (2, 2)}
 """Kernel and stride."""
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""Of LPIPS's input layer, for images in [-1, 1]."""
+"""Shift and scale of LPIPS's input layer, for images in [-1, 1]."""
 
 
 class Lpips(nn.Module):

@@ -44,7 +44,6 @@ from oasis_warp.estimation.estimator import HandEstimator, check_sides, choose_h
 from oasis_warp.estimation.fit_quality import keeps_quality, with_pose
 from oasis_warp.estimation.hand_crop import (
     COARSE_SIZE,
-    Surfaces,
     crop_hands,
     crop_landmarks,
     crop_side,
@@ -76,13 +75,13 @@ class Reconstruction(NamedTuple):
     fit: HandFit
     """In the photo's own frame."""
     prior: Mapping[str, str | int]
-    """Which prior was used: its `about`."""
+    """`about` of the prior that was used."""
     stages: dict[str, float]
     """Seconds of each stage."""
     errors: dict[str, float]
     """What was measured: reprojection_percent, mask_iou, input_psnr_db, ..."""
     warnings: tuple[str, ...]
-    """Of the fit, the photo and what it shows, in words; empty when nothing is doubtful."""
+    """Warnings about the fit, the photo and what it shows; empty when nothing is doubtful."""
     quality: SurfaceQuality
     """How well each place of the surface is known."""
 
@@ -109,7 +108,7 @@ class FusedReconstruction(NamedTuple):
     """In the light of the first photo, whose pose and camera are its source."""
     photos: tuple[PhotoOfHand, ...]
     prior: Mapping[str, str | int]
-    """Which prior was used: its `about`."""
+    """`about` of the prior that was used."""
     stages: dict[str, float]
     """Seconds of each stage."""
     errors: dict[str, float]
@@ -124,7 +123,7 @@ Stage = Callable[[str], AbstractContextManager[None]]
 
 
 class _Outcome(NamedTuple):
-    """What the stages make of K photos."""
+    """Results of all stages for K photos."""
 
     fused: FusedReconstruction
     """Without warnings."""
@@ -174,7 +173,7 @@ def reconstruct_same_hand(
     perceptual: Perceptual | None = None,
     progress: Progress = silent,
 ) -> FusedReconstruction:
-    """Make one avatar of one hand of which there are several photos, of any poses.
+    """Make one avatar from several photos of one hand, in any poses.
 
     Args:
         photos: From `oasis_warp.read_photo`, or their files. The first decides on exposure and white balance, the
@@ -248,17 +247,15 @@ def _run(
     avatar = make_avatar(fits[0], surfaces.shared, crops[0], gaussians, light, invented, hand=hand)
     with stage("quality"):
         areas = surface.vertex_areas(crops[0].rest.vertices, hand.faces.to(config.device))
-        parts = [
-            _assess(hand, adaptation, k, fits[k], surfaces, crops[k], close[k], perceptual) for k in range(len(photos))
-        ]
-        quality = combine_quality([part[0] for part in parts])._replace(invented=invented)
+        views = zip(fits, surfaces.own, crops, close, strict=True)
+        judged = [_assess(hand, adaptation, k, *view, perceptual) for k, view in enumerate(views)]
+        quality = combine_quality([own for own, _ in judged])._replace(invented=invented)
         coverage = coverage_percent(hand, areas, quality)
         shares = coverage_of_photos(areas, adaptation.observations.confidence, adaptation.observations.share)
         warnings = [photo_warnings(c.image, c.mask, crop_side(fit)) for c, fit in zip(close, fits, strict=True)]
-    measured = [{"refined_px": px} | part[1] | own for px, part, own in zip(moved, parts, shares, strict=True)]
+    measured = [{"refined_px": px} | errors | own for px, (_, errors), own in zip(moved, judged, shares, strict=True)]
     lights = adaptation.lights or [None] * len(photos)
-    names = [photo.name for photo in photos]
-    about = tuple(map(PhotoOfHand, names, fits, _tuples(adaptation.gains), measured, lights))
+    about = tuple(map(PhotoOfHand, [p.name for p in photos], fits, _tuples(adaptation.gains), measured, lights))
     coverage["n_gaussians"] = float(len(avatar.gaussians.opacities))
     fused = FusedReconstruction(avatar, about, prior.about, stages, coverage, (), quality)
     return _Outcome(fused, warnings, coverage_warnings(coverage))
@@ -272,7 +269,7 @@ def _fit(
     stage: Stage,
     progress: Progress,
 ) -> tuple[list[Landmarks | HandFit], list[HandFit]]:
-    """What is found in each photo, or given, and the fits of one hand to all of them."""
+    """The landmarks that are found in each photo, or given, and the fits of one hand to all photos."""
     estimator = HandEstimator(hand, config.device)
     with stage("landmarks"):
         found = [
@@ -289,7 +286,7 @@ def _fit(
 def _finish(
     hand: HandModel, adaptation: Adaptation, crops: Sequence[HandCrop], config: ReconstructConfig, stage: Stage
 ) -> tuple[Adaptation, Float[Tensor, "V"] | None]:
-    """The adaptation with what no photo shows, and where that was painted; with a closed wrist."""
+    """Paint what no photo shows and close the wrist: the adaptation, and where skin was painted."""
     gaussians, invented, first = adaptation.gaussians, None, crops[0]
     if config.unseen == "painted":
         with stage("painting"):
@@ -305,7 +302,7 @@ def _finish(
 def _guess(
     prior: Prior, crops: Sequence[HandCrop], config: ReconstructConfig
 ) -> tuple[list[CanonicalGaussians], ColorHeads | None]:
-    """The guess of each photo, and the heads behind the only one where they are to be trained."""
+    """The guess of each photo. With "lora" and "full" there is one, and its colour heads come with it to be trained."""
     if config.adapt == "field":
         return [prior(crop) for crop in crops], None
     guess, heads = guess_with_heads(prior, crops[0])
@@ -313,7 +310,7 @@ def _guess(
 
 
 def _adaptation(config: ReconstructConfig) -> AdaptConfig:
-    """The options of the adaptation that are not those of a photo as a whole."""
+    """The options of the adaptation."""
     if config.adapt == "field":
         return AdaptConfig(light=config.light, texture_steps=config.steps, seed=config.seed)
     steps = PAPER_ADAPTATION.texture_steps if config.steps is None else config.steps
@@ -327,7 +324,7 @@ def _tuples(gains: Float[Tensor, "K 3"]) -> list[tuple[float, float, float]]:
 def _refine_fits(
     hand: HandModel, guesses: Sequence[CanonicalGaussians], crops: Sequence[HandCrop], fits: Sequence[HandFit]
 ) -> tuple[list[HandFit], list[float]]:
-    """Fits in the poses that explain their photos best, and how far each hand moved [px]; 0 where it is left."""
+    """Fits in the poses that explain their photos best, and how far each hand moved [px]; 0 where that was rejected."""
     refined, moved = [], []
     for guess, crop, fit in zip(guesses, crops, fits, strict=True):
         found = refine(hand, guess, crop, crop_landmarks(fit, crop.camera), native_size(fit))
@@ -339,14 +336,14 @@ def _refine_fits(
 
 
 def _assess(
-    hand: HandModel, adaptation: Adaptation, k: int, fit: HandFit, surfaces: Surfaces, crop: HandCrop, close: HandCrop,
-    perceptual: Perceptual | None,
+    hand: HandModel, adaptation: Adaptation, k: int, fit: HandFit, offsets: Float[Tensor, "V 3"], crop: HandCrop,
+    close: HandCrop, perceptual: Perceptual | None,
 ) -> tuple[SurfaceQuality, dict[str, float]]:  # fmt: skip
-    """How well photo k is explained, in its own light and on the surface by which it was read."""
+    """How well photo k is explained, in its own light and on the surface that it was read on."""
     gaussians = adaptation.gaussians
     as_bright = gaussians._replace(colors=(gaussians.colors * adaptation.gains[k]).clamp(0, 1))
     light = adaptation.lights[k] if adaptation.lights else None
-    avatar = make_avatar(fit, surfaces.own[k], crop, as_bright, light, hand=hand)
+    avatar = make_avatar(fit, offsets, crop, as_bright, light, hand=hand)
     drawn, near = draw_as_photo(avatar, crop, fit.pose), draw_as_photo(avatar, close, fit.pose)
     errors = {
         "reprojection_percent": fit.reprojection,
@@ -358,7 +355,7 @@ def _assess(
 
 
 def input_errors(drawn: Render, crop: HandCrop, perceptual: Perceptual | None = None) -> dict[str, float]:
-    """How well an avatar, drawn over black as `crop` shows it, explains its photo inside the mask above the wrist."""
+    """Errors of an avatar against its photo, inside the mask above the wrist; it was `drawn` over black."""
     image, alpha = drawn
     judged = crop.above_wrist > 0.5
     inside = ((crop.mask > 0.5) & judged).to(image)

@@ -161,7 +161,7 @@ def write_conditioning(folder: Path, conditioning: Conditioning) -> None:
 
 
 def keypoints(conditioning: Conditioning, size: int) -> dict[str, object]:
-    """The pose and camera as a file of `--keypoints` has them, for a picture of `size` pixels."""
+    """The pose and camera as a file for `--keypoints`, for a picture of `size` pixels."""
     pose, K = conditioning.pose, conditioning.camera.K * (size / conditioning.camera.width)
     return {
         "side": conditioning.side,
@@ -196,7 +196,7 @@ def choose_generator(given: str) -> Generator:
 
 
 def _hosted(model: str | None) -> Generator:
-    """An image-to-image model that Hugging Face or one of its providers runs; depth and words are sent there.
+    """A hosted image-to-image model, run by Hugging Face or one of its providers; depth and words are sent there.
 
     `model` is its name, or the address of an endpoint; None for the one that the service recommends.
     """
@@ -258,7 +258,7 @@ def _command(line: str) -> Generator:
 
 
 def _filled(word: str, values: dict[str, str]) -> str:
-    """`word` with the first of the places replaced, then the rest: what was put in is not read again."""
+    """`word` with its placeholders replaced, from first to last; what was filled in is not searched again."""
     for place, value in values.items():
         before, found, after = word.partition(place)
         if found:
@@ -322,12 +322,12 @@ def imagine(
     """The first picture with this hand in this pose, of the seeds `seed`, `seed` + 1, ...
 
     Args:
-        generator: Of the pictures.
+        generator: Generator of the pictures.
         estimator: Finds the hand in them.
         conditioning: What was asked for.
         folder: With the conditioning's files.
         prompt: The words.
-        seed: Of the first picture.
+        seed: Seed of the first picture.
         tries: Number of pictures to ask for.
         progress: Called for every picture.
 
@@ -350,7 +350,7 @@ def imagine(
 
 
 def _distance(estimator: HandEstimator, conditioning: Conditioning, photo: Photo) -> float | str:
-    """How far the landmarks are off [%], or in words why this is not the hand asked for."""
+    """Distance of the landmarks from those asked for [%], or a message why this is another hand."""
     height, width = photo.rgb.shape[:2]
     if abs(height - width) > SQUARE * width:
         return f"{width} x {height} pixels instead of a square"

@@ -24,9 +24,9 @@ from oasis_warp.avatar.pose import (
     in_even_light,
     pose_gaussians,
     posed_lighting,
+    rotate_light,
     shading,
     shading_factors,
-    turn_light,
     with_photo,
 )
 from oasis_warp.avatar.prior import MeanPrior
@@ -122,7 +122,7 @@ def test_light_stays_when_the_hand_turns(hand, scene):
     rotated = pose._replace(orientation=half @ pose.orientation)
     before, after = lit.pose(pose).colors, lit.pose(rotated).colors
     assert float((before - after).abs().max()) > 0.1
-    follows = avatar_of(hand, truth, pose, even.camera, turn_light(LIGHT, half))
+    follows = avatar_of(hand, truth, pose, even.camera, rotate_light(LIGHT, half))
     torch.testing.assert_close(follows.pose(rotated).colors, before, atol=1e-5, rtol=0)
 
 
@@ -176,7 +176,7 @@ def test_shade_stays_as_long_as_skin_faces_as_in_the_photo(hand, scene, of):
     torch.testing.assert_close(away[around], torch.ones_like(away[around]))
     torch.testing.assert_close(shaded.in_even_light().gaussians.colors, plain.in_even_light().gaussians.colors)
     assert shaded.in_even_light().gaussians.shade is None
-    turned_light = turn_light(light, rotation.from_axis_angle(torch.tensor([0.0, 1.0, 0.0]), torch.tensor(0.7)))
+    turned_light = rotate_light(light, rotation.from_axis_angle(torch.tensor([0.0, 1.0, 0.0]), torch.tensor(0.7)))
     mirrored = mirror_light(mirror_light(turned_light))
     assert same_light(mirrored, turned_light)
 

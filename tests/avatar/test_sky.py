@@ -8,10 +8,10 @@ from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.pose import (
     Lighting,
     posed_lighting,
+    remaining_shade,
+    rotate_light,
     shading_factors,
-    shares_that_stay,
     split_shade,
-    turn_light,
     with_photo_colors,
 )
 from oasis_warp.avatar.sky import bounced, environment_light, harmonic_basis, radiance, sky_mesh, studio_light
@@ -87,12 +87,12 @@ def test_deep_shade_beside_a_finger_that_lay_there_goes_with_it_and_weak_shade_s
     place = hand.template[(label_regions(hand).palm > 0.9) & (hand.segment == 0)].mean(0)
     away = (hand.template - place).norm(dim=1)
     was = torch.where(away < 0.003, shared - 0.5, shared)  # something lay there
-    stays = shares_that_stay(EVEN._replace(facing=on.normals), on, was)
+    stays = remaining_shade(EVEN._replace(facing=on.normals), on, was)
     beside, far = (away > 0.006) & (away < 0.008), away > 0.03
     assert float(stays[beside, 0].max()) < 0.1 and float(stays[beside, 1].min()) == 1
     assert float(stays[far].min()) == 1
     covered = torch.where(away < 0.003, shared + 0.5, shared)  # now something lies there: a palm's lines stay in a fist
-    assert float(shares_that_stay(EVEN._replace(facing=on.normals), on, covered).min()) == 1
+    assert float(remaining_shade(EVEN._replace(facing=on.normals), on, covered).min()) == 1
     dark, relief = (
         truth._replace(colors=torch.full_like(truth.colors, 0.5), shade=torch.full_like(truth.colors, factor))
         for factor in (0.4, 0.9)
@@ -116,7 +116,7 @@ def test_weak_shade_in_doubt_goes_when_the_sky_changes_nearby(hand):
     seen[beside[beside != here]] = 0.2
     on, light = Lighting(facing, torch.ones(n_vertices, 4)), EVEN._replace(facing=facing)
     for doubt, left in ((0.0, 1.0), (1.0, 0.0)):
-        stays = shares_that_stay(light._replace(doubt=torch.full((n_vertices,), doubt)), on, seen)
+        stays = remaining_shade(light._replace(doubt=torch.full((n_vertices,), doubt)), on, seen)
         assert float(stays[here, 0]) == 0 and float(stays[here, 1]) == left
 
 
@@ -152,7 +152,7 @@ def test_harmonics_turn_and_mirror_with_the_world(rows):
     n = torch.nn.functional.normalize(torch.randn(20, 3, generator=generator), dim=1)
     turn = rotation.from_axis_angle(torch.tensor([0.0, 0.6, 0.8]), torch.tensor(0.9))
     before = harmonic_basis(n, rows) @ light.harmonics
-    after = harmonic_basis(n @ turn.T, rows) @ turn_light(light, turn).harmonics
+    after = harmonic_basis(n @ turn.T, rows) @ rotate_light(light, turn).harmonics
     torch.testing.assert_close(after, before, atol=1e-5, rtol=1e-4)
     mirrored = harmonic_basis(mirror_points(n), rows) @ mirror_light(light).harmonics
     torch.testing.assert_close(mirrored, before)

@@ -1,7 +1,9 @@
-"""Fingers and palm of a posed hand give way to each other instead of passing through."""
+"""Posed skin touches skin without passing through it, and named poses touch alike on hands of all shapes."""
 
 import math
+from statistics import median
 
+import numpy as np
 import pytest
 import torch
 from hand_build.quality import self_crossings
@@ -11,10 +13,10 @@ from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.core import rotation, surface
 from oasis_warp.core.mirror import mirror_points
 from oasis_warp.core.processes import using_threads
-from oasis_warp.core.types import HandPose
-from oasis_warp.hand.contact import LIMIT, giving_way
-from oasis_warp.hand.poses import named_pose
-from oasis_warp.hand.skinning import rest_hand, skin_surface
+from oasis_warp.core.types import HandPose, PosedHand
+from oasis_warp.hand.contact import LIMIT, resolve_contact
+from oasis_warp.hand.poses import POSE_NAMES, named_pose
+from oasis_warp.hand.skinning import rest_hand, skin, skin_surface
 
 
 def posed(hand, name, seed):
@@ -32,7 +34,7 @@ def fist(hand):
 
 @pytest.fixture(scope="module")
 def led_out(hand, fist):
-    return giving_way(hand, fist)
+    return resolve_contact(hand, fist)
 
 
 def test_a_fist_of_another_shape_crosses_itself_ten_times_less(hand, fist, led_out):
@@ -59,31 +61,31 @@ def test_what_no_contact_reaches_stays_to_the_bit(hand, fist, led_out):
     assert still[hand.rim].all()
     assert 0.5 < float(still.float().mean()) < 0.95
     opened = posed(hand, "open", 103)
-    assert torch.equal(giving_way(hand, opened), opened)
+    assert torch.equal(resolve_contact(hand, opened), opened)
 
 
 def test_a_left_hand_gives_way_as_its_mirror_image(hand, fist, led_out):
-    mirrored = giving_way(hand, mirror_points(fist), "left")
+    mirrored = resolve_contact(hand, mirror_points(fist), "left")
     torch.testing.assert_close(mirrored, mirror_points(led_out), rtol=0, atol=1e-6)
 
 
 def test_a_hand_that_moves_as_a_whole_gives_way_alike(hand, fist, led_out, device):
     turn = rotation.from_axis_angle(torch.tensor([0.6, 0.0, 0.8]), torch.tensor(1.9))
     shift = torch.tensor([0.1, -0.2, 0.4])
-    moved = giving_way(hand.to(device), (fist @ turn.T + shift).to(device)).cpu()
+    moved = resolve_contact(hand.to(device), (fist @ turn.T + shift).to(device)).cpu()
     off = (moved - (led_out @ turn.T + shift)).norm(dim=1)
     assert float((off > 1e-5).float().mean()) < 0.003  # of two vertices equally near it may take the other
 
 
 def test_many_poses_and_threads_give_the_same_bits(hand, fist, led_out):
     with using_threads(3):
-        both = giving_way(hand, torch.stack([posed(hand, "open", 103), fist]))
+        both = resolve_contact(hand, torch.stack([posed(hand, "open", 103), fist]))
     assert torch.equal(both[1], led_out)
 
 
 def test_the_shift_is_a_constant_to_derivatives(hand, fist):
     vertices = fist.double().requires_grad_()
-    (slope,) = torch.autograd.grad(giving_way(hand, vertices).sum(), vertices)
+    (slope,) = torch.autograd.grad(resolve_contact(hand, vertices).sum(), vertices)
     assert slope.eq(1).all()
 
 
@@ -102,18 +104,86 @@ def test_an_avatar_is_posed_out_of_its_own_flesh_but_in_the_photos_pose(hand):
     _, made, plain = surfaces(0)
     assert torch.equal(made, plain)
     means, made, plain = surfaces(11)
-    assert torch.equal(made, giving_way(hand, plain)) and not torch.equal(made, plain)
+    assert torch.equal(made, resolve_contact(hand, plain)) and not torch.equal(made, plain)
     torch.testing.assert_close(means, made[truth.vertex_index])
     _, made, plain = surfaces(5)
-    torch.testing.assert_close(made - plain, (giving_way(hand, plain) - plain) / 2, rtol=1e-3, atol=1e-7)
+    torch.testing.assert_close(made - plain, (resolve_contact(hand, plain) - plain) / 2, rtol=1e-3, atol=1e-7)
 
 
 @pytest.mark.gpu
-def test_giving_way_is_recorded_in_a_graph(hand, fist):
+def test_resolving_contact_is_recorded_in_a_graph(hand, fist):
     hand, vertices = hand.to("cuda"), fist.to("cuda")
-    expected = giving_way(hand, vertices)
+    expected = resolve_contact(hand, vertices)
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):
-        made = giving_way(hand, vertices)
+        made = resolve_contact(hand, vertices)
     graph.replay()
     assert torch.equal(made, expected)
+
+
+@pytest.fixture(scope="module")
+def rests(hand):
+    """Hands of other shapes."""
+    shapes = np.random.default_rng(3).normal(size=(6, len(hand.shape_names)))
+    return [rest_hand(hand, torch.from_numpy(shape).float()) for shape in shapes]
+
+
+@pytest.fixture(scope="module")
+def mean_rest(hand):
+    return rest_hand(hand, torch.zeros(len(hand.shape_names)))
+
+
+def gap(hand, rest, angles, *bones):
+    """Distance between the skin of two bones."""
+    vertices = skin(hand, rest, HandPose(angles, torch.eye(3), torch.zeros(3))).vertices
+    one, other = (vertices[hand.segment == hand.joint_names.index(bone)] for bone in bones)
+    return float(torch.cdist(one, other).min())
+
+
+@pytest.mark.parametrize("name", POSE_NAMES)
+def test_the_mean_hand_takes_named_poses_as_they_stand_in_the_table(hand, mean_rest, name):
+    torch.testing.assert_close(named_pose(hand, name, mean_rest), named_pose(hand, name), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["pinch", "ok"])
+def test_thumb_and_index_meet_on_hands_of_other_shapes(hand, rests, mean_rest, name):
+    tips = "thumb3", "index3"
+    expected = gap(hand, mean_rest, named_pose(hand, name), *tips)
+    plain = [gap(hand, rest, named_pose(hand, name), *tips) for rest in rests]
+    made = [gap(hand, rest, named_pose(hand, name, rest), *tips) for rest in rests]
+    assert max(plain) > expected + 0.003  # the table's angles leave them apart
+    assert max(made) < expected + 0.001
+
+
+def test_fingers_of_a_fist_lie_as_close_as_on_the_mean_hand(hand, rests, mean_rest):
+    for pair in [("index2", "middle2"), ("middle2", "ring2"), ("ring2", "little2")]:
+        expected = gap(hand, mean_rest, named_pose(hand, "fist"), *pair)
+        made = [gap(hand, rest, named_pose(hand, "fist", rest), *pair) for rest in rests]
+        assert median(made) < expected + 0.0005 and max(made) < expected + 0.002, pair
+
+
+@pytest.mark.parametrize("name", ["fist", "victory", "ok"])
+def test_angles_stay_within_limits_and_near_the_table(hand, rests, name):
+    table, limits = named_pose(hand, name), hand.pose_limits[1:]
+    for rest in rests:
+        angles = named_pose(hand, name, rest)
+        assert 0 < (angles - table).abs().max().rad2deg() < 30
+        assert (angles >= torch.minimum(limits[..., 0], table) - 1e-6).all()
+        assert (angles <= torch.maximum(limits[..., 1], table) + 1e-6).all()
+
+
+def test_straight_fingers_stay_as_they_are(hand, rests):
+    table = named_pose(hand, "open")
+    assert all(torch.equal(named_pose(hand, "open", rest), table) for rest in rests)
+
+
+def test_a_hand_of_mano_touches_as_the_bundled_one(mano):
+    rest = rest_hand(mano, torch.zeros(mano.shape_basis.shape[2]))
+    tips = "thumb3", "index3"
+    assert gap(mano, rest, named_pose(mano, "ok", rest), *tips) < 0.002
+
+
+@pytest.mark.gpu
+def test_a_hand_on_the_device_takes_the_same_pose(hand, rests):
+    there = named_pose(hand.to("cuda"), "ok", PosedHand(*(part.cuda() for part in rests[0])))
+    torch.testing.assert_close(there.cpu(), named_pose(hand, "ok", rests[0]))

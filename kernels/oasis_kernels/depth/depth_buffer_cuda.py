@@ -19,8 +19,8 @@ CULLED_SHARE = 8 * SHARE
 QUEUE = 1 << 17
 """Faces that the queue holds at the most."""
 START_BITS = 44
-"""Of the queue's counter, for the number of shares; the bits above count faces. A picture has fewer than 2^31 pixels,
-so that 2^17 faces fit; what other warps add while the queue fills up, eight faces each, fits as well."""
+"""Bits of the queue's counter for the number of shares; the bits above count faces. A picture has fewer than 2^31
+pixels, so that 2^17 faces fit; what other warps add while the queue fills up, eight faces each, fits as well."""
 MAX_PIXELS = 4
 """Pixels of a thread of `resolve`."""
 PEAKS = 1024

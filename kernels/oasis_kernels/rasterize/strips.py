@@ -82,10 +82,10 @@ def draw(channels: int, rules: Rules) -> Native:
 
 
 class Gradients(NamedTuple):
-    """Which gradients an adjoint is built for."""
+    """The gradients that an adjoint is built for."""
 
     channels: int
-    """Of the incoming gradient by the image; 0 where there is only one by alpha."""
+    """Channels of the incoming gradient by the image; 0 where there is only one by alpha."""
     shape: bool
     """By means2d, covars2d and opacities."""
     color: bool

@@ -1,4 +1,4 @@
-"""Which Gaussians each tile of the image must draw, nearest first.
+"""Lists of the Gaussians that each tile of the image must draw, nearest first.
 
 A pair is one (Gaussian, tile). `count_tiles` and `emit_pairs` write the pairs in depth order of their Gaussians, one
 thread per Gaussian, and a stable sort by tile gives each tile its Gaussians from front to back. Pairs are numbered so

@@ -10,8 +10,8 @@ from oasis_kernels.runtime.cuda_native import CudaNative, cuda_native
 TILE = 8
 """Side of a tile [px]."""
 INDEX_BITS = 24
-"""Of a key, for the index of a Gaussian among those of its camera. 39 bits hold its depth: 7 of exponent, from 2^-64
-to 2^63, and 32 of mantissa."""
+"""Bits of a key for the index of a Gaussian among those of its camera. 39 bits hold its depth: 7 of exponent, from
+2^-64 to 2^63, and 32 of mantissa."""
 COUNTERS = 5
 """64-bit words before the counts of the tiles: pairs numbered; then of `place_tiles` tiles with pairs << 38 | pairs,
 empty tiles, longest list, blocks done. All are zero before `count_pairs` and again after `place_tiles`."""

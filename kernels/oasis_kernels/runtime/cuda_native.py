@@ -50,9 +50,9 @@ def cuda_native(
 
     Args:
         path: Relative to the package.
-        name: Of the function.
+        name: Name of the function.
         block: Threads of a block: a power of two.
-        blocks_per_multiprocessor: That many shall fit at once: limits the registers of a thread.
+        blocks_per_multiprocessor: Number of blocks that shall fit at once: limits the registers of a thread.
         label: Name of the kernel as profilers show it; `name` if None.
         constants: Macros that the function sees, besides `BLOCK` and `WARPS`, the threads and warps of a block.
         scalar: "float" or "double": what `T` stands for in the parameters.

@@ -13,7 +13,7 @@ BLOCK = 256
 CHUNK = 16 * BLOCK
 """Numbers that a block on CUDA reads."""
 ARRAYS = 10
-"""That fit into one launch on CUDA."""
+"""Arrays that fit into one launch on CUDA."""
 
 ALL_FINITE: Native = native("runtime/finite.cpp", "all_finite")
 """CPU kernel: `count` pairs of an address and a length of float32 -> 1 in `found` if a number is not within 1e15."""

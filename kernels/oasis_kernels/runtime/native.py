@@ -62,7 +62,7 @@ def native(
 
     Args:
         path: Relative to the package.
-        name: Of the function.
+        name: Name of the function.
         label: Name of the kernel as profilers show it; `name` if None.
         constants: Macros that the function sees, besides `PHASE_WORDS` and `TASK`.
         scalar: "float" or "double": what `T` stands for in the parameters.

@@ -18,7 +18,7 @@ wp.set_module_options({"enable_backward": False})  # fast_math makes NaN of powe
 
 SKIN = wp.constant(0)
 MATERIAL_WORDS = wp.constant(6)
-"""Of what is worn: red, green, blue, roughness, metal, cloth."""
+"""Numbers of a material that is worn: red, green, blue, roughness, metal, cloth."""
 CLOTH_CELL = wp.constant(0.0012)
 SHEEN = wp.constant(0.028)
 """Reflectance of skin seen straight on."""

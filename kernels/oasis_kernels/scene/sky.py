@@ -10,7 +10,7 @@ vec9 = wp.types.vector(length=9, dtype=wp.float32)
 TAPS = wp.constant(12)
 BLOCKERS = wp.constant(6)
 WIDEST = wp.constant(0.06)
-"""Of half shadows [m]."""
+"""Widest half shadow [m]."""
 GOLDEN_ANGLE = wp.constant(2.3999632)
 
 

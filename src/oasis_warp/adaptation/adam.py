@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 DECAYS = 0.9, 0.999
-"""Of the means of gradients and of their squares: Kingma and Ba's (2015, section 2), as torch's."""
+"""Decay rates of the means of gradients and of their squares, from Kingma and Ba (2015, section 2) as in torch."""
 EPSILON = 1e-8
 
 

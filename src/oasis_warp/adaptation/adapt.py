@@ -10,7 +10,7 @@ from torch import Tensor
 from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.adaptation.prior_guess import Calibration, calibrate, mix_guesses
 from oasis_warp.adaptation.reliability import VertexObservations, observe_photos, photo_gains
-from oasis_warp.adaptation.sh_lighting import light_evenly, split_albedo_shading
+from oasis_warp.adaptation.sh_lighting import match_light, split_albedo_shading
 from oasis_warp.adaptation.sharpen import sharpen
 from oasis_warp.adaptation.texture import Targets, learn_lora, learn_texture, make_targets, reference_azimuths
 from oasis_warp.adaptation.unlit import (
@@ -55,7 +55,7 @@ class Adaptation(NamedTuple):
     """Before adaptation: the guesses of all photos, mixed."""
     calibration: Calibration
     losses: tuple[float, ...]
-    """Of texture learning, one a step."""
+    """Loss of each step of texture learning."""
     observations: VertexObservations
     """What the photos show without their lights."""
     gains: Float[Tensor, "K 3"]
@@ -82,11 +82,11 @@ class _Photos(NamedTuple):
     gains: Float[Tensor, "K 3"]
     views: Sequence[PhotoView]
     stacked: BlendWeights
-    """Of all views, one below the other."""
-    belief: Sequence[Float[Tensor, "S S"]]
+    """Weights of all views, one below the other."""
+    pixel_shares: Sequence[Float[Tensor, "S S"]]
     """How far each pixel counts beside the other photos; 0 where the guess does not cover it."""
     trust: Float[Tensor, "K V"]
-    """Of `trust_in_albedo`; 1 where light is kept."""
+    """Result of `trust_in_albedo`; 1 where the light is kept."""
 
 
 def adapt(
@@ -102,19 +102,20 @@ def adapt(
 ) -> Adaptation:
     """Fit colours to the photos; geometry stays.
 
-    Colours are calibrated, then inpainted beyond the rim of the seen region, then learned with reference views. With
-    `config.light` "fit" the first two steps look at photos without their light, where they surely show the hand; the
-    last one draws colours in that light, and most of what it learns beyond the prior is shade, which goes when the hand
-    turns. With "even" other likely light is left out too, and nothing is learned. With `config.texture` "lora" or
-    "full" nothing is inpainted, as in the paper. Several photos count in each pixel by how well they show the place.
+    The colours are calibrated, then inpainted beyond the rim of the seen region, then learned with reference views.
+    With `config.light` "fit" the first two steps look at photos without their light, and only where they reliably show
+    the hand. The last step draws in that light; most of what it learns beyond the prior becomes shade, which goes when
+    the hand turns. With "even" other likely light is left out, too, and nothing is learned. With `config.texture`
+    "lora" or "full" nothing is inpainted, as in the paper. Several photos count in each pixel by how well they show the
+    place.
 
     Args:
         hand: The model.
-        guesses: Of the prior, one for each photo.
+        guesses: Guesses of the prior, one for each photo.
         crops: The photos, with one surface at rest, on one device, of one size.
         config: Options.
         resolutions: Pixels of each photo for one pixel of its crop, along a line; 1 if not given.
-        heads: Of the one guess, for these two: see `network.prior.guess_with_heads`.
+        heads: Colour heads of the one guess, for these two: see `network.prior.guess_with_heads`.
         perceptual: LPIPS, which the paper's loss of pictures has too; only of one photo.
         progress: Called as work goes on.
 
@@ -125,7 +126,7 @@ def adapt(
     progress("calibration", 0, 1)
     guess, photos = _gather(hand, guesses, crops, resolutions, config)
     evenly_exposed = [crop.image / gain for crop, gain in zip(photos.unlit, photos.gains, strict=True)]
-    trust = [inner_mask(crop.mask, 1) * share for crop, share in zip(photos.unlit, photos.belief, strict=True)]
+    trust = [inner_mask(crop.mask, 1) * share for crop, share in zip(photos.unlit, photos.pixel_shares, strict=True)]
     repeated = guess.colors.repeat(len(crops), 1)
     calibration = calibrate(photos.stacked, repeated, torch.cat(evenly_exposed), torch.cat(trust), config)
     calibrated = gaussians = guess._replace(colors=calibration.apply(guess.colors))
@@ -168,13 +169,13 @@ def add_detail(
     size: int,
     progress: Progress = silent,
 ) -> Adaptation:
-    """The adaptation with finer Gaussians, which show each place as the photo does that shows it best.
+    """The adaptation with finer Gaussians. Each place takes its detail from the photo that shows it best.
 
     Args:
         hand: The model.
         adaptation: To these photos.
         crops: The photos again, as large as their detail.
-        resolutions: Of these; see `adapt`.
+        resolutions: Resolutions of these crops; see `adapt`.
         size: Side of the crops that were adapted to [px]. A photo whose crop is no larger has no detail to give, and no
             other photo gives any where it is the best.
         progress: Called as the colours are fitted.
@@ -205,7 +206,7 @@ def add_detail(
 def light_factors(
     hand: HandModel, gaussians: CanonicalGaussians, crop: HandCrop, light: HandLight
 ) -> Float[Tensor, "N 3"]:
-    """What the light of a photo multiplies the colours of `gaussians` with in it."""
+    """Factors by which the light of a photo multiplies the colours of `gaussians`."""
     rest, faces = crop.rest.vertices, hand.faces.to(crop.image.device)
     return shading_factors(gaussians, faces, light, posed_lighting(rest, crop.posed.vertices, faces, light))
 
@@ -228,16 +229,16 @@ def _gather(
     guess = mix_guesses(guesses, seen.confidence * seen.share + UNSEEN, faces)
     if guess is not guesses[0]:
         views = [view_in_photo(hand, guess, crop) for crop in crops]
-    belief = []
+    pixel_shares = []
     for view, share in zip(views, seen.share, strict=True):
         others = blend_colors(view.weights, vertex_to_gaussians(1 - share[:, None], faces, guess))
         alphas = view.weights.alphas
-        belief.append(((1 - others / alphas.clamp_min(MIN_ALPHA)) * (alphas > 0.5))[..., 0])
+        pixel_shares.append(((1 - others / alphas.clamp_min(MIN_ALPHA)) * (alphas > 0.5))[..., 0])
     lights = tuple(photo.light for photo in read if photo.light is not None) or None
     gains = photo_gains(seen, vertex_colors(guess, len(hand.template)))
     stacked = stack_weights([view.weights for view in views])
     trust = torch.stack([trust_in_photo(hand, crop, photo) for crop, photo in zip(crops, read, strict=True)])
-    return guess, _Photos(crops, unlit, lights, seen, gains, views, stacked, belief, trust)
+    return guess, _Photos(crops, unlit, lights, seen, gains, views, stacked, pixel_shares, trust)
 
 
 def _complete(
@@ -247,7 +248,7 @@ def _complete(
     pictures: Sequence[Float[Tensor, "S S 3"]],
     config: AdaptConfig,
 ) -> tuple[CanonicalGaussians, Float[Tensor, "K V 3"]]:
-    """Calibrated Gaussians with what the photos show of them, faded out around it, and `Adaptation.shading`.
+    """Calibrated Gaussians, inpainted from what the photos show of them, and `Adaptation.shading`.
 
     `pictures` are the photos without their lights, as bright as the first.
     """
@@ -272,7 +273,7 @@ def _complete(
         missing = differences()
     if config.light == "even":
         pictures = [
-            light_evenly(picture, own, *at_vertices, view.weights, gaussians, rest, faces)
+            match_light(picture, own, *at_vertices, view.weights, gaussians, rest, faces)
             for picture, own, view, *at_vertices in zip(pictures, drawn, views, missing, seen.confidence, strict=True)
         ]
         missing = differences()
@@ -287,14 +288,14 @@ def _texture_targets(
 ) -> Targets:
     """The photos one below the other, each in its own light, and reference views around the first.
 
-    Divided by a picture of their light, photos would be wrong where two fingers share a pixel.
+    The photos are not divided by a picture of their light: that would be wrong where two fingers share a pixel.
     """
     first, faces = photos.crops[0], hand.faces.to(shading.device)
     references = [
         view_weights(photos.views[0].posed, orbit_camera(first.posed.vertices, azimuth, size=first.camera.width))
         for azimuth in reference_azimuths(config.reference_views)
     ]
-    mask = [c.mask * inner_mask(c.mask, 1) * own for c, own in zip(photos.crops, photos.belief, strict=True)]
+    mask = [c.mask * inner_mask(c.mask, 1) * own for c, own in zip(photos.crops, photos.pixel_shares, strict=True)]
     factors, pictures = [], []
     for k, (crop, view) in enumerate(zip(photos.crops, photos.views, strict=True)):
         factor = photos.gains[k].expand_as(gaussians.colors)
@@ -313,7 +314,7 @@ def _in_first_light(
     hand: HandModel, photo: Float[Tensor, "S S 3"], weights: BlendWeights, gaussians: CanonicalGaussians, gain: Tensor,
     shading: Float[Tensor, "V 3"],
 ) -> Float[Tensor, "S S 3"]:  # fmt: skip
-    """The photo without what its light has of its own, drawn by the `gaussians` of `weights`."""
+    """The photo in the light of the first: without its gain, and with its shading correction as `weights` draw it."""
     own = vertex_to_gaussians(shading, hand.faces.to(photo.device), gaussians)
     return photo / gain + blend_colors(weights, own) / weights.alphas.clamp_min(MIN_ALPHA)
 
@@ -321,10 +322,11 @@ def _in_first_light(
 def _shading_corrections(
     hand: HandModel, rest: Float[Tensor, "V 3"], differences: Float[Tensor, "K V 3"], confidence: Float[Tensor, "K V"]
 ) -> Float[Tensor, "K V 3"]:
-    """What to add to each photo, smoothly over the skin, so that photos agree wherever two show the same place.
+    """Smooth corrections to each photo, so that photos agree wherever two show the same place.
 
-    Lamps stand elsewhere in every photo, and fingers shade each other. No photo is right about it: all move to the mean
-    of what each differs from the guess, the guess itself among them. Detail stays with the photo that shows it best.
+    Every photo has its lamps elsewhere, and fingers shade each other. No photo is right about that, so all move to the
+    mean of their differences from the guess; the guess itself is one of them. Detail stays with the photo that shows it
+    best.
     """
     smooth = torch.stack([
         inpaint(rest, hand.faces, own, seen, detail=SHADING_LENGTH, fade=SHADING_REACH)

@@ -30,7 +30,7 @@ def inpaint(
     the lumped mass matrix M.
 
     Args:
-        vertices: Of the surface [m].
+        vertices: Vertices of the surface [m].
         faces: Corners.
         observed: Values; those without confidence do not matter.
         confidence: 0 to 1.

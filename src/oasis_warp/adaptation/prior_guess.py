@@ -34,7 +34,7 @@ def mix_guesses(
     Args:
         guesses: On one surface at rest.
         weight: How far to follow each guess at each vertex; positive.
-        faces: Of the surface.
+        faces: Faces of the surface.
     """
     if len(guesses) == 1:
         return guesses[0]

@@ -1,7 +1,7 @@
-"""How far photos can be trusted: pixels that surely show the skin there, and vertices that one photo shows best.
+"""How far photos can be trusted: pixels that reliably show the skin, and vertices that one photo shows best.
 
-A fitted hand lies some pixels beside the photo's. At its outlines the photo then shows the background instead, or, of a
-finger in front of the palm, the finger: taken over, they are stains and ghosts in every other pose.
+A fitted hand lies some pixels beside the photo's. At its outlines the photo then shows the background instead, or the
+finger in front of the palm. Taken over, these pixels would be stains and ghosts in every other pose.
 """
 
 from collections.abc import Sequence
@@ -42,8 +42,8 @@ SURE_PLACE = 0.012, 0.02
 """Spreads of a place between which the reading begins to waver between two fingers [m]: beside another place such a
 pixel does not count either."""
 UNSURE_REACH, OTHER_REACH = 6 / PRIOR_SIZE, 1 / PRIOR_SIZE
-"""Around pixels of another place, over the picture's side: in which an unsure reading is of that place, too, and in
-which no pixel counts."""
+"""Distances from pixels of another place, over the picture's side. Within the first an unsure reading is of that place,
+too; within the second no pixel counts."""
 OUTSIDE = 0.05
 """Share of hand in a pixel below which it shows the background."""
 
@@ -52,7 +52,7 @@ def mask_unreliable(hand: HandModel, drawn: Float[Tensor, "S S 3"], crop: HandCr
     """The same crop with a mask that leaves out what may be background, or another part of the hand.
 
     Args:
-        hand: Whose surface it is.
+        hand: Model of the surface.
         drawn: What the hand looks like in the light of the photo, everywhere on it.
         crop: The photo.
     """
@@ -64,7 +64,7 @@ def mask_unreliable(hand: HandModel, drawn: Float[Tensor, "S S 3"], crop: HandCr
 
 
 def _background_share(drawn: Float[Tensor, "S S 3"], crop: HandCrop) -> Float[Tensor, "S S"]:
-    """0 to 1: how far, near the border, the photo's colour lies on the way from the hand's to the background's."""
+    """How far the colour near the border lies on the way from the hand's to the background's, 0 to 1."""
     side = len(crop.mask)
     outside = (crop.mask < OUTSIDE).to(drawn)
     planes = torch.cat([crop.image * outside[..., None], outside[..., None]], -1).permute(2, 0, 1)[None]
@@ -72,8 +72,8 @@ def _background_share(drawn: Float[Tensor, "S S 3"], crop: HandCrop) -> Float[Te
     for _ in range(2):
         planes = avg_pool2d(planes, window, stride=1, padding=window // 2)
     background = (planes[0, :3] / planes[0, 3:].clamp_min(1e-6)).permute(1, 2, 0)
-    way = background - drawn
-    share = ((crop.image - drawn) * way).sum(-1) / way.square().sum(-1).clamp_min(SAME_COLOR)
+    contrast = background - drawn
+    share = ((crop.image - drawn) * contrast).sum(-1) / contrast.square().sum(-1).clamp_min(SAME_COLOR)
     return ((share - FEW) / (MANY - FEW)).clamp(0, 1) * _largest(outside, STAIN_REACH)
 
 
@@ -97,9 +97,10 @@ def _behind_outline(hand: HandModel, seen: DepthMap) -> Bool[Tensor, "S S"]:
 def _other_places(
     hand: HandModel, seen: DepthMap, reading: Float[Tensor, "S S 4"] | None
 ) -> Float[Tensor, "S S"] | float:
-    """0 to 1: how surely a pixel shows another place than the fitted surface has there, by the network's reading.
+    """How likely a pixel shows another place than the fitted surface there, by the network's reading, 0 to 1.
 
-    The tip of a finger whose fit lies a little beside it would be printed on the palm. 0 without a reading.
+    Without this, the tip of a finger whose fit lies a little beside it would be printed on the palm. 0 without a
+    reading.
     """
     if reading is None:
         return 0.0
@@ -123,10 +124,10 @@ def _largest(values: Float[Tensor, "S S"], reach: float) -> Float[Tensor, "S S"]
 SHARPNESS = 2.0
 """Power of a photo's pixels over those of the best one: with 1, detail that does not quite meet is averaged away."""
 GUESS_WEIGHT = 0.25
-"""Of the prior's guess against a photo that sees a place well, where the light of photos is compared."""
+"""Weight of the prior's guess where the light of photos is compared; a photo that sees a place well has weight 1."""
 LIKELY_DIFFERENCE = 0.15
-"""Of the logarithms of a colour that two photos show of one place, once their light as a whole agrees: shading, a pose
-that is a little off. Larger ones count less."""
+"""Usual difference between the logarithms of a colour that two photos show of one place, once their light as a whole
+agrees: shading, or a pose that is a little off. Larger differences count less."""
 GAIN_ROUNDS = 12
 DARKEST, BRIGHTEST = 0.02, 0.98
 """Values beyond which a sensor is blind, or clips."""
@@ -143,11 +144,11 @@ class VertexObservations(NamedTuple):
 
 
 def observe_photos(hand: HandModel, crops: Sequence[HandCrop], resolutions: Sequence[float]) -> VertexObservations:
-    """What every photo shows, and which to believe: most the one that spends most pixels on the skin there.
+    """What every photo shows, and how far to believe each: most the one that spends most pixels on the skin there.
 
     Args:
         hand: The model.
-        crops: Of K photos of one hand.
+        crops: Crops of K photos of one hand.
         resolutions: Pixels of each photo for one pixel of its crop, along a line; below 1 the crop is an enlargement.
     """
     seen = [observe(hand, crop) for crop in crops]
@@ -172,15 +173,15 @@ def _pixel_density(crop: HandCrop, seen: Observation) -> Float[Tensor, "V"]:
 
 
 def photo_gains(observations: VertexObservations, guess: Float[Tensor, "V 3"]) -> Float[Tensor, "K 3"]:
-    """How much brighter each photo shows each channel than the first one does.
+    """Brightness of each channel of each photo, relative to the first photo.
 
-    The least squares of all differences of the logarithms of colours that two photos show of one place, with one
-    unknown a photo and channel. The guess is one more photo, with a small weight: it joins palm and back, which no
-    photo shows together. In a place whose photos weigh w_k, the pair k, l weighs w_k w_l / sum w, as it does when the
-    place's own colour is eliminated. Reweighted against shadows and misplaced detail (Cauchy).
+    Least squares over the differences of the logarithms of colours that two photos show of one place, with one unknown
+    a photo and channel. The guess is one more photo with a small weight: it joins palm and back, which no photo shows
+    together. In a place whose photos have weights w_k, the pair k, l has the weight w_k w_l / sum w; the same follows
+    from eliminating the place's own colour. Shadows and misplaced detail are weighted down (Cauchy).
 
     Args:
-        observations: Of K photos.
+        observations: Observations of K photos.
         guess: Colours of the vertices as the prior has them, in any light.
     """
     n_photos = len(observations.colors)
@@ -189,14 +190,14 @@ def photo_gains(observations: VertexObservations, guess: Float[Tensor, "V 3"]) -
     trust = (observations.confidence * observations.share)[..., None] * clear
     trust = torch.cat([trust, GUESS_WEIGHT * (trust.amax(0, keepdim=True) > 0)]).to(logs)
     gains = logs.new_zeros(n_photos + 1, 3)
-    still = 1e-6 * torch.eye(n_photos, dtype=logs.dtype, device=logs.device)  # a photo that shows nothing keeps 1
+    ridge = 1e-6 * torch.eye(n_photos, dtype=logs.dtype, device=logs.device)  # a photo that shows nothing keeps 1
     weight = trust
     for _ in range(GAIN_ROUNDS):
         total = weight.sum(0).clamp_min(1e-12)
         pairs = torch.einsum("kvc,lvc->ckl", weight / total, weight)
         system = torch.diag_embed(pairs.sum(-1)) - pairs
         right = (weight * (logs - (weight * logs).sum(0) / total)).sum(1).T
-        gains[:n_photos] = torch.linalg.solve(system[:, :-1, :-1] + still, right[:, :-1]).T
+        gains[:n_photos] = torch.linalg.solve(system[:, :-1, :-1] + ridge, right[:, :-1]).T
         even = logs - gains[:, None]
         apart = even - (weight * even).sum(0) / total
         weight = trust / (1 + (apart / LIKELY_DIFFERENCE) ** 2)

@@ -57,8 +57,8 @@ MIN_PAINT = 0.02
 SPACING = 1.0
 """Distance between the finer Gaussians [pixels of the painted picture]."""
 RINGS = 4
-"""Of faces round the paint whose Gaussians are replaced, too: those of a learned prior reach so far, and would lay a
-veil over the paint in other views."""
+"""Rings of faces around the paint whose Gaussians are replaced, too. Gaussians of a learned prior reach so far, and
+would lay a veil over the paint in other views."""
 ZOOMS = (1.0, 2.0)
 """Sizes of the views beside the photo's over its own: the smaller a picture, the more the rasterizer's own blur."""
 
@@ -137,9 +137,9 @@ class RepaintResult(NamedTuple):
     """Those that were not touched are the same bit for bit, in their order; the new ones are the last."""
     n_new: int
     faces: Bool[Tensor, "F"]
-    """Whose Gaussians are new: under the paint, and their neighbours."""
+    """Faces whose Gaussians are new: those under the paint, and their neighbours."""
     area: float
-    """Of the painted surface at rest [m^2]."""
+    """Area of the painted surface at rest [m^2]."""
     left_out: float
     """Share of the paint on the hand that was left out: on a slant, or beside an edge in front of it."""
     losses: tuple[float, ...]
@@ -164,11 +164,11 @@ def repaint(
 
     Args:
         gaussians: On the surface at rest.
-        faces: Of the surface.
+        faces: Faces of the surface.
         rest: Vertices at rest [m].
         posed: Vertices in the photo's pose [m], in the world of the canvas's camera.
         canvas: What was painted.
-        steps: Of accelerated projected gradient descent.
+        steps: Steps of accelerated projected gradient descent.
         progress: Called as work goes on.
 
     Raises:

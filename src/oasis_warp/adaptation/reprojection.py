@@ -21,10 +21,10 @@ STEP = 0.003
 FAR = 1e3
 """Stands for an infinite depth where depths are subtracted [m]."""
 NEARBY_ANGLES = ((0.0, 0.45), (0.0, -0.45), (0.45, 0.0), (-0.45, 0.0))
-"""Of the views beside the photo's, about its horizontal and its vertical axis [rad]. Which Gaussian hides which depends
-on the view; colours that suit one view alone come out shifted and frayed in others."""
+"""Angles of the views beside the photo's, about its horizontal and its vertical axis [rad]. Which Gaussian hides which
+depends on the view; colours that suit one view alone come out shifted and frayed in others."""
 PHOTO_WEIGHT = 2.0
-"""Of a pixel in the photo's own view, against those beside it."""
+"""Weight of a pixel in the photo's own view; a pixel in the views beside it has weight 1."""
 PULL = 0.05
 """Weight that holds each new Gaussian at the colour read off the picture [pixels]."""
 MARGIN = 8
@@ -49,7 +49,7 @@ class SurfaceMap(NamedTuple):
     barycentrics: Float[Tensor, "H W 3"]
     """In those faces."""
     share: Float[Tensor, "H W"]
-    """Of each pixel that is in the mask and on a surface that faces the camera, clear of edges in front of it."""
+    """Share of each pixel that is in the mask and on a surface that faces the camera, clear of edges in front of it."""
 
 
 class Source(NamedTuple):
@@ -68,7 +68,7 @@ class TargetView(NamedTuple):
     goal: Float[Tensor, "H W 3"]
     """What the changed Gaussians have to add to the picture."""
     weight: float
-    """Of each of its pixels."""
+    """Weight of each pixel of the view."""
 
 
 def map_surface(

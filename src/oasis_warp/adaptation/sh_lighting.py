@@ -1,9 +1,9 @@
 """The light of a photo as spherical harmonics, and the split of what they do not explain into albedo and shade.
 
 Two photos of one hand agree on little of what they show beyond the prior. Where skin faces as before, a third to a half
-of it is found again; where it has turned by more than 45 degrees, a tenth at most (docs/avatar.md). The rest is
-shadows, gloss, wrinkles of the pose, and misplaced detail. So most of it becomes shade, which the photo's own view
-keeps and other poses lose. Only marks, whose colours light cannot give to skin, stay in the albedo as a whole.
+of it is found again; where skin has turned by more than 45 degrees, a tenth at most (docs/avatar.md). The rest is
+shadows, gloss, wrinkles of the pose, and misplaced detail. So most of it becomes shade: the photo's own view keeps it
+and other poses lose it. Only marks whose colours light cannot give to skin stay in the albedo as a whole.
 """
 
 from collections.abc import Sequence
@@ -46,8 +46,8 @@ ROUNDS = 2
 ALBEDOS = 0.02, 0.8
 """Least and greatest reflectance of skin."""
 PRIOR_WEIGHT = 0.01
-"""Weight of this prior, against a light of which every direction is seen: of .001, .003, .01, .03 and .1 the best for
-six synthetic people whom no evaluation uses, by .06 dB and more."""
+"""Weight of this prior against a light that is seen in every direction: of .001, .003, .01, .03 and .1 the best for six
+synthetic people whom no evaluation uses, by .06 dB and more."""
 MIN_CONFIDENCE = 0.1
 """Confidence from which a vertex counts as visible."""
 LIMIT_QUANTILES = 0.03, 0.97
@@ -69,16 +69,16 @@ OUTLINE_MARGIN = 1 / 32
 
 
 def fit_light(hand: HandModel, drawn: Float[Tensor, "H W 3"], crop: HandCrop) -> HandLight:
-    """The light in which `drawn` looks most like the photo.
+    """Fit the light in which `drawn` looks most like the photo.
 
     Weighted least squares of photo = drawn (h_0 + h . n) e over the visible vertices, in linear light, for all channels
-    at once: the first two bands of the harmonics of irradiance (Ramamoorthi and Hanrahan 2001), and the share e of this
-    light that the hand lets through in the photo's pose, so that soft shadows between fingers are no skin. The share
-    depends on the light: it is that of an even one at first. A photo shows only skin that faces it, so a normal prior
-    on the harmonics constrains the rest (maximum a posteriori). If nothing is visible, the light is even.
+    at once. The harmonics are the first two bands of the irradiance (Ramamoorthi and Hanrahan 2001). The share e of
+    this light arrives past the hand in the photo's pose, so that soft shadows between fingers do not become skin. It
+    depends on the light; the first round takes that of even light. A photo shows only skin that faces it, so a normal
+    prior on the harmonics constrains the rest (maximum a posteriori). If nothing is visible, the light is even.
 
     Args:
-        hand: Whose surface it is.
+        hand: Model of the surface.
         drawn: The hand in even light, in the photo's view; defined everywhere on the hand.
         crop: The photo.
     """
@@ -91,7 +91,7 @@ def fit_light(hand: HandModel, drawn: Float[Tensor, "H W 3"], crop: HandCrop) ->
     light, on = even, posed_lighting(rest, crop.posed.vertices, faces, even)
     basis = harmonic_basis(on.normals, 4)
     for _ in range(ROUNDS):
-        weighted = seen._replace(confidence=seen.confidence * exposed(on))
+        weighted = seen._replace(confidence=seen.confidence * exposure_confidence(on))
         harmonics = _solve_harmonics(basis, known * _arriving(light, on), weighted)
         light = light._replace(harmonics=harmonics)
         on = posed_lighting(rest, crop.posed.vertices, faces, light)
@@ -108,8 +108,8 @@ def fit_light(hand: HandModel, drawn: Float[Tensor, "H W 3"], crop: HandCrop) ->
     )
 
 
-def exposed(on: Lighting) -> Float[Tensor, "V"]:
-    """How far the photo shows the colour of skin there, by the share of the sky that it sees: 0 to 1."""
+def exposure_confidence(on: Lighting) -> Float[Tensor, "V"]:
+    """How far the photo shows the colour of skin, by the share of the sky that the skin sees: 0 to 1."""
     if on.exposure is None:
         return torch.ones_like(on.normals[..., 0])
     t = ((on.exposure[..., 0] - HIDDEN) / (OPEN - HIDDEN)).clamp(0, 1)
@@ -117,29 +117,29 @@ def exposed(on: Lighting) -> Float[Tensor, "V"]:
 
 
 def trust_in_albedo(hand: HandModel, crop: HandCrop, sure: HandCrop, light: HandLight) -> Float[Tensor, "V"]:
-    """How far what a photo shows beyond a guess is skin and not shadow, or another part of the hand: 0 to 1.
+    """Probability that what a photo shows beyond a guess is skin, not shadow or another part of the hand: 0 to 1.
 
     Args:
-        hand: Whose surface it is.
+        hand: Model of the surface.
         crop: The photo.
         sure: The same with the mask of `mask_unreliable`.
-        light: Of the photo.
+        light: Light of the photo.
     """
     on = posed_lighting(crop.rest.vertices, crop.posed.vertices, hand.faces.to(crop.image.device), light)
-    every, believed = (observe(hand, which).confidence for which in (crop, sure))
-    trust = exposed(on) * _believed_share(every, believed)
+    every, reliable = (observe(hand, which).confidence for which in (crop, sure))
+    trust = exposure_confidence(on) * _reliable_share(every, reliable)
     if light.shade is None:
         return trust
     return trust * (1 - light.shade.log().mean(-1).abs() / SHADED).clamp(0, 1)
 
 
-def _believed_share(every: Float[Tensor, "V"], believed: Float[Tensor, "V"]) -> Float[Tensor, "V"]:
-    """Confidence with the mask of reliable pixels over that with all of the mask; 1 where the photo shows nothing."""
-    return torch.where(every > 0, believed / every.clamp_min(1e-6), 1).clamp(0, 1)
+def _reliable_share(every: Float[Tensor, "V"], reliable: Float[Tensor, "V"]) -> Float[Tensor, "V"]:
+    """Confidence with the mask of reliable pixels, over that with the whole mask; 1 where the photo shows nothing."""
+    return torch.where(every > 0, reliable / every.clamp_min(1e-6), 1).clamp(0, 1)
 
 
 def _even_light(albedo: Float[Tensor, "3"]) -> HandLight:
-    """The same from all around, on skin of this mean reflectance."""
+    """Even light on skin of this mean reflectance."""
     harmonics = torch.zeros_like(albedo).repeat(4, 1)
     harmonics[0] = 1
     return HandLight(harmonics, torch.ones_like(harmonics[:2]), harmonics[0], albedo=albedo.clamp(*ALBEDOS))
@@ -153,7 +153,7 @@ def _arriving(light: HandLight, on: Lighting) -> Float[Tensor, "V 3"]:
 def _solve_harmonics(
     basis: Float[Tensor, "V 4"], reflected: Float[Tensor, "V 3"], seen: Observation
 ) -> Float[Tensor, "4 3"]:
-    """The most likely harmonics of a photo in which light of 1 from all around would be `reflected`."""
+    """The most likely harmonics of a photo, given the `reflected` colours under a light of 1 from all around."""
     weight, light = seen.confidence, seen.colors.clamp(0, 1) ** GAMMA
     terms = basis * reflected.T[..., None]  # of each channel, [3, V, 4]
     scale = (weight[:, None] * reflected.square()).sum(0).clamp_min(torch.finfo(reflected.dtype).eps)
@@ -167,30 +167,30 @@ def _solve_harmonics(
 def add_shade(
     hand: HandModel, drawn: Float[Tensor, "H W 3"], crop: HandCrop, sure: HandCrop, light: HandLight
 ) -> HandLight:
-    """`light` with a shade for its errors where the photo may show something else than the skin.
+    """Add a shade to `light` for its errors where the photo may show something else than the skin.
 
     Args:
-        hand: Whose surface it is.
+        hand: Model of the surface.
         drawn: The hand in even light, in the photo's view; defined everywhere on the hand.
         crop: The photo.
         sure: The same with the mask of `mask_unreliable`.
-        light: Of the photo.
+        light: Light of the photo.
     """
     faces, rest = hand.faces.to(drawn.device), crop.rest.vertices
     lit = apply_light(hand, drawn, crop, light)
     seen, known = observe(hand, crop), observe(hand, crop._replace(image=lit)).colors
     missing = (seen.colors.clamp_min(MIN_COLOR) / known.clamp_min(MIN_COLOR)).log()
     on = posed_lighting(rest, crop.posed.vertices, faces, light)
-    believed = observe(hand, sure).confidence
+    reliable = observe(hand, sure).confidence
     fade = rim_fade(rest[None], hand.rim.to(rest.device))[0]  # the cap has no shade
-    doubt = (seen.confidence - believed * exposed(on)) * fade
+    doubt = (seen.confidence - reliable * exposure_confidence(on)) * fade
     occluded = inpaint(rest, faces, missing, doubt, OCCLUDER_FADE / 3, OCCLUDER_FADE)
     shade = occluded.clamp(-MAX_LOG_SHADE, MAX_LOG_SHADE).exp()
-    return light._replace(shade=shade, facing=on.normals, doubt=1 - _believed_share(seen.confidence, believed))
+    return light._replace(shade=shade, facing=on.normals, doubt=1 - _reliable_share(seen.confidence, reliable))
 
 
 def shading_picture(hand: HandModel, crop: HandCrop, light: HandLight) -> Float[Tensor, "H W 3"]:
-    """What `light` multiplies the colours of the photo of `crop` with; continued a little beyond the hand, then 1."""
+    """Factor of `light` on the colours of the photo of `crop`; continued a little beyond the hand, then 1."""
     camera, posed = crop.camera, crop.posed.vertices
     faces = hand.faces.to(posed.device)
     on = posed_lighting(crop.rest.vertices, posed, faces, light)
@@ -232,7 +232,7 @@ SKIN_DEVIATION = 0.007
 nothing against the prior's own colours and .007 up to .06 dB, but real skin has more to it."""
 
 
-def light_evenly(
+def match_light(
     image: Float[Tensor, "H W 3"],
     drawn: Float[Tensor, "H W 3"],
     missing: Float[Tensor, "V 3"],
@@ -252,8 +252,8 @@ def light_evenly(
         image: The photo.
         drawn: Picture of the calibrated prior.
         missing: `image - drawn` at the vertices.
-        confidence: Of that.
-        view: Of `gaussians` in the photo.
+        confidence: Confidence of the colours.
+        view: View of `gaussians` in the photo.
         gaussians: Which `drawn` shows.
         vertices: The surface at rest [m].
         faces: Corners.
@@ -266,7 +266,7 @@ def light_evenly(
 
 
 def weighted_deviation(values: Float[Tensor, "V 3"], weight: Float[Tensor, "V"]) -> Tensor:
-    """Weighted median of the values' magnitudes: a robust deviation, which tattoos and highlights do not change."""
+    """Weighted median of the values' magnitudes: a deviation that tattoos and highlights do not change."""
     size = values.square().mean(1).sqrt()
     order = size.argsort()
     below = weight[order].cumsum(0)
@@ -293,13 +293,13 @@ MARK_BRIGHTNESSES = 0.45, 0.7
 def split_albedo_shading(
     hand: HandModel, guess: Float[Tensor, "N 3"], learned: CanonicalGaussians, trust: Float[Tensor, "V"] | None = None
 ) -> CanonicalGaussians:
-    """The learned Gaussians with part of their colours split off as shade; colours times shade are as before.
+    """Split off part of the learned Gaussians' colours as shade; colours times shade stay as they were.
 
     Args:
-        hand: Whose surface it is.
+        hand: Model of the surface.
         guess: Colours of the Gaussians before they were learned.
         learned: In even light.
-        trust: Of `trust_in_albedo`, 1 if not given: the rest of what was learned is all shade, marks or not.
+        trust: Result of `trust_in_albedo`, 1 if not given: the rest of what was learned is all shade, marks or not.
     """
     ratio = learned.colors.clamp_min(MIN_COLOR) / guess.clamp_min(MIN_COLOR)
     beyond = ratio.log().clamp(-MAX_LOG_SHADE, MAX_LOG_SHADE)
@@ -316,7 +316,7 @@ def split_albedo_shading(
 
 
 def mark_probability(beyond: Float[Tensor, "V 3"]) -> Float[Tensor, "V 1"]:
-    """0 to 1: how likely a difference of the logarithms of colours is a mark on the skin, rather than light."""
+    """Probability that a difference of the logarithms of colours is a mark on the skin and not light."""
     across = (beyond @ beyond.new_tensor(ACROSS_SHADING).T).norm(dim=-1)
     likely = [
         ((measure - low) / (high - low)).clamp(0, 1)
@@ -335,16 +335,16 @@ SLANTED, OPENLY = 0.15, 0.4
 def limit_shade(
     hand: HandModel, gaussians: CanonicalGaussians, crops: Sequence[HandCrop], light: HandLight
 ) -> CanonicalGaussians:
-    """The Gaussians with no more shade than light gives to skin where all photos show it on a slant.
+    """Limit the shade to what light gives to skin, where all photos show that skin on a slant.
 
-    There a pixel shows what lies beside an outline as well, floor between fingers for one: in the photo's view a rim of
-    a pixel, from the side a streak along a finger.
+    A pixel there also shows what lies beside the outline, such as the floor between fingers. In the photo's view this
+    is a rim of one pixel, but from the side it is a streak along a finger.
 
     Args:
-        hand: Whose surface it is.
+        hand: Model of the surface.
         gaussians: Adapted to the photos.
         crops: The photos.
-        light: Of the first.
+        light: Light of the first.
     """
     if gaussians.shade is None:
         return gaussians

@@ -50,7 +50,7 @@ TOLERANCE = 3 / 255
 SPACINGS = (4.0, 3.0, 2.0)
 """Distances between finer Gaussians to choose from [px]; at 1.5 and 1 they show no more."""
 MIN_SHARE = 0.5
-"""Of a pixel that counts, from which its face may be cut."""
+"""Least share of hand in a pixel that counts; only faces with such pixels are cut."""
 THICKNESS = 0.45e-3
 """Standard deviation of finer Gaussians across the surface [m]. The surface that carries Gaussians lies below the skin,
 which coarse ones reach because they are thick: with thin ones fingers lose half a millimetre. With .6 mm none is lost,
@@ -60,7 +60,7 @@ MIN_ALPHA = 0.05
 MIN_FACTOR = 0.02
 """Least factor of the light by which colours are divided."""
 STEPS = 15
-"""Of the colours' fit, which starts at the colours of the photo; 40 come to the same."""
+"""Steps of the colour fit. It starts at the colours of the photo; 40 steps give the same result."""
 SHRUNK = 2
 """The pictures that are fitted are also fitted this many times smaller: from afar the rasterizer widens fine Gaussians,
 and those in front would hide more of the others than they do from near."""
@@ -82,60 +82,58 @@ def sharpen(
     hand: HandModel,
     gaussians: CanonicalGaussians,
     crops: Sequence[HandCrop],
-    believed: Float[Tensor, "K V"] | None = None,
+    shares: Float[Tensor, "K V"] | None = None,
     trust: Float[Tensor, "K V"] | None = None,
     light: HandLight | None = None,
     progress: Progress = silent,
 ) -> SharpenResult:
     """Replace Gaussians by finer ones where pictures of the hand show more than they do.
 
-    A face whose picture differs from the avatar's is cut into as many parts as it takes to show what is there; faces
+    A face whose picture differs from the avatar's is cut into as many parts as it takes to show what is there. Faces
     around it are cut as well, so that finer Gaussians fade into coarser ones. The colours minimise the squared
-    difference of pictures that are linear in them: a photo in its own view, and what the surface carries of all photos
-    in four views beside, in both sizes; of several photos each the colours where it is believed most, one after the
-    other. At outlines, on a slant and where the wrist ends the avatar stays as it is.
+    difference of pictures that are linear in them: a photo in its own view, and in four views beside it what the
+    surface carries of all photos, in both sizes. Several photos are fitted one after the other, each with the colours
+    that it shows best. At outlines, on a slant and where the wrist ends the avatar stays as it is.
 
     Args:
-        hand: Whose surface it is.
+        hand: Model of the surface.
         gaussians: Fitted to the photos, perhaps in smaller pictures of them.
-        crops: Of K photos, as large as their detail, with one surface at rest and in one light.
-        believed: How far to believe each at each vertex, at most 1 in all; a single photo wholly.
+        crops: Crops of K photos, as large as their detail, with one surface at rest and in one light.
+        shares: Share of each photo at each vertex, at most 1 in all; a single photo wholly.
         trust: How far what each shows is skin, 0 to 1, wholly if not given: the rest of the detail is shade, if there
             is any shade.
-        light: Of a single photo, which is then given as taken. Without, photos are in even light. Divided by a picture
-            of its light, a photo would be wrong where a bright finger and a dark hollow share a pixel.
+        light: Light of a single photo, which is then given as taken; without it, photos are in even light. A photo
+            divided by a picture of its light would be wrong where a bright finger and a dark hollow share a pixel.
         progress: Called as work goes on.
     """
     rest = crops[0].rest.vertices
     faces = hand.faces.to(rest.device)
-    believed = rest.new_ones(1, len(rest)) if believed is None else believed
+    shares = rest.new_ones(1, len(rest)) if shares is None else shares
     fading = torch.cdist(rest, rest[hand.rim.to(rest.device)]).amin(1) < FADE_REACH * RIM_FADE
     fading = with_neighbours(fading[faces].any(1), faces, len(rest))
-    sources = [_source(e, faces, fading, own) for e, own in zip(crops, believed, strict=True)]
+    sources = [_source(e, faces, fading, own) for e, own in zip(crops, shares, strict=True)]
     on = None if light is None else posed_lighting(rest, sources[0].posed, faces, light)
-    old = [pose_gaussians(_as_lit(gaussians, faces, light, on), faces, rest, source.posed) for source in sources]
+    old = [pose_gaussians(_lit(gaussians, faces, light, on), faces, rest, source.posed) for source in sources]
     around, parts = _parts(rest, faces, sources, old)
     if not bool(around.any()):
         return SharpenResult(gaussians, 0, ())
     dense, changed, n_new = densify(gaussians, rest, faces, parts, thickness=THICKNESS)
-    shown = _as_lit(dense, faces, light, on)
+    shown = _lit(dense, faces, light, on)
     new = [pose_gaussians(shown, faces, rest, source.posed) for source in sources]
     start = overlay_pictures(shown.colors[changed], sources, [there.means[changed] for there in new])
     colors = shown.colors.masked_scatter(changed[:, None], start)
-    whose = vertex_to_gaussians(believed.T, faces, dense).argmax(1)
-    whose_face = believed[:, faces].mean(-1).argmax(0)
+    best = vertex_to_gaussians(shares.T, faces, dense).argmax(1)
+    best_of_face = shares[:, faces].mean(-1).argmax(0)
     losses: list[float] = []
-    for k, source in enumerate(sources):
-        mine = changed & (whose == k)
-        if not bool(mine.any()):
-            continue
-        still = torch.where(mine[:, None], 0, colors)
-        points = source.posed[faces[around & (whose_face == k)]].flatten(0, 1)
-        views = _views(sources, k, points, faces, old[k], new[k], still)
-        learned, own = fit_colors(views, colors[mine], mine, STEPS, progress)
-        colors, losses = still.masked_scatter(mine[:, None], learned), [*losses, *own]
+    for k in best[changed].unique().tolist():
+        fitted = changed & (best == k)
+        fixed = torch.where(fitted[:, None], 0, colors)
+        points = sources[k].posed[faces[around & (best_of_face == k)]].flatten(0, 1)
+        views = _views(sources, k, points, faces, old[k], new[k], fixed)
+        learned, of_photo = fit_colors(views, colors[fitted], fitted, STEPS, progress)
+        colors, losses = fixed.masked_scatter(fitted[:, None], learned), [*losses, *of_photo]
     if trust is not None:
-        trust = vertex_to_gaussians(trust.T, faces, dense).gather(1, whose[:, None])[changed]
+        trust = vertex_to_gaussians(trust.T, faces, dense).gather(1, best[:, None])[changed]
     if light is not None and on is not None:
         colors = colors / shading_factors(dense._replace(shade=None), faces, light, on).clamp_min(MIN_FACTOR)
     return SharpenResult(with_photo_colors(dense, changed, colors[changed], trust), n_new, tuple(losses))
@@ -154,7 +152,7 @@ def _parts(
     return around, torch.where(around, parts_for_spacing(rest, faces, spacing).clamp_min(2), 1)
 
 
-def _as_lit(
+def _lit(
     gaussians: CanonicalGaussians, faces: Int[Tensor, "F 3"], light: HandLight | None, on: Lighting | None
 ) -> CanonicalGaussians:
     """With the colours that photos show, in `light` if there is one."""
@@ -165,18 +163,18 @@ def _as_lit(
 
 
 def _source(
-    crop: HandCrop, faces: Tensor, fading: Bool[Tensor, "F"], believed: Float[Tensor, "V"]
+    crop: HandCrop, faces: Tensor, fading: Bool[Tensor, "F"], share: Float[Tensor, "V"]
 ) -> Source:
-    """The photo on its surface, with nothing of it on `fading` faces and elsewhere as much as it is believed."""
+    """The photo on its surface, weighted by `share`, and by 0 on `fading` faces."""
     posed, canvas = crop.posed.vertices, Canvas(crop.image, _faded_in(crop.mask), crop.camera)
     seen = map_surface(posed, faces, canvas, FACING)
     ids = seen.faces.clamp_min(0)
-    trust = torch.where(fading[ids], 0, (believed[faces[ids]] * seen.barycentrics).sum(-1))
+    trust = torch.where(fading[ids], 0, (share[faces[ids]] * seen.barycentrics).sum(-1))
     return Source(canvas, seen._replace(share=seen.share * trust), posed)
 
 
 def _views(
-    sources: Sequence[Source], k: int, points: Tensor, faces: Tensor, old: Gaussians, new: Gaussians, still: Tensor
+    sources: Sequence[Source], k: int, points: Tensor, faces: Tensor, old: Gaussians, new: Gaussians, fixed: Tensor
 ) -> list[TargetView]:
     """Pictures of `points` in the pose of source k: in the photo's view and beside it, in both sizes."""
     camera, posed, views = sources[k].canvas.camera, sources[k].posed, []
@@ -189,7 +187,7 @@ def _views(
         for goal, shown, scale in ((target / alpha, near, 1), (small, _smaller(near), SHRUNK)):
             weights = view_weights(new, shown)
             # Coverage is not to be fitted: in a small picture the rasterizer draws outlines wider.
-            goal = goal * weights.alphas - blend_colors(weights, still)
+            goal = goal * weights.alphas - blend_colors(weights, fixed)
             views.append(TargetView(weights, goal, weight * scale**2))
     return views
 

@@ -100,7 +100,7 @@ def _smooth_noise(faces: bytes, dtype: torch.dtype, n_vertices: int, seed: int) 
 
 
 def _first_corner(faces: Int[Tensor, "F 3"], n_vertices: int) -> Int[Tensor, "V"]:
-    """Of each vertex, the first place among the faces' corners."""
+    """The first place of each vertex among the faces' corners."""
     flat = faces.flatten().cpu()
     place = torch.full((n_vertices,), len(flat))
     return place.scatter_reduce_(0, flat, torch.arange(len(flat)), "amin")

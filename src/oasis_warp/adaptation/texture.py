@@ -35,7 +35,8 @@ class Targets(NamedTuple):
     """What is drawn, and what it must look like."""
 
     weights: BlendWeights
-    """Of the photo; of K photos `ops.stack_weights` of theirs, with `picture` and `mask` one below the other, too."""
+    """Weights of the photo. K photos are stacked by `ops.stack_weights`, their pictures and masks one below the
+    other."""
     picture: Float[Tensor, "H W 3"]
     """The photo. It shows through where the Gaussians leave it free, as at the wrist: over black they would learn to
     glow there."""
@@ -55,7 +56,7 @@ class Texture(NamedTuple):
 
     colors: Float[Tensor, "N 3"]
     losses: tuple[float, ...]
-    """Of every step, reference views included."""
+    """Loss of every step, reference views included."""
 
 
 def make_targets(
@@ -85,10 +86,10 @@ def fit_parameters(
 
     Args:
         parameters: Leaves that want gradients.
-        colors: Of the Gaussians with the parameters as they are.
+        colors: Colours of the Gaussians with the parameters as they are.
         penalty: Added to the loss of pictures.
         targets: Those pictures.
-        learning_rate: Of Adam.
+        learning_rate: Learning rate of Adam.
         config: Steps and weights. With `references` "in_turn" one reference view takes part in each step, all of them
             in turn, in an order that `seed` shuffles; with "all" every one, by the photo's loss.
         progress: Called as work goes on.
@@ -130,7 +131,7 @@ def fit_parameters(
 
 
 def _picture_loss(image: Tensor, targets: Targets, masked: SsimTarget, config: AdaptConfig) -> Tensor:
-    """Of `image` beside the photo, which `masked` holds inside its mask."""
+    """Loss of `image` against the photo; `masked` holds the photo inside its mask."""
     picture, mask = targets.picture, targets.mask
     loss = config.weight_rgb * masked_l1(image, picture, mask)
     if targets.perceptual is not None:
@@ -139,7 +140,7 @@ def _picture_loss(image: Tensor, targets: Targets, masked: SsimTarget, config: A
 
 
 def _reference_loss(colors: Tensor, targets: Targets, k: int, config: AdaptConfig) -> Tensor:
-    """Of view k, for all of them."""
+    """Loss of reference view k, times the number of views."""
     view = targets.references[k]
     drift = masked_l1(blend_colors(view, colors), targets.expected[k], view.alphas[..., 0])
     return config.weight_rgb * len(targets.references) * drift
@@ -166,7 +167,7 @@ def _is_flat(losses: list[Tensor]) -> bool:
 
 
 LEARNING_RATE = 0.05
-"""Of the logits of colour."""
+"""Learning rate of the colour logits."""
 RESIDUAL_DECAY = 0.02
 """Weight of the squared difference of a face's logit from those of its corners: what lies together looks alike."""
 ROUGHNESS_DECAY = 0.5
@@ -195,13 +196,13 @@ def learn_texture(
     n_vertices, n_points = int(faces.max()) + 1, len(gaussians.vertex_index)
     field = torch.zeros(n_vertices, 3, dtype=base.dtype, device=base.device, requires_grad=True)
     residual = torch.zeros(len(gaussians.face_index), 3, dtype=base.dtype, device=base.device, requires_grad=True)
-    still = torch.zeros(n_points, 3, dtype=base.dtype, device=base.device)
+    none = torch.zeros(n_points, 3, dtype=base.dtype, device=base.device)
     trust, vertex_trust = _trust(gaussians, faces, targets.weights)
     edges = surface.mesh_edges(faces)
 
     def colors() -> Tensor:
         learned = vertex_to_gaussians(vertex_trust * field, faces, gaussians)
-        return torch.sigmoid(base + learned + trust * torch.cat([still, residual]))
+        return torch.sigmoid(base + learned + trust * torch.cat([none, residual]))
 
     def penalty() -> Tensor:
         ends = (vertex_trust * field).index_select(0, edges.flatten()).unflatten(0, (-1, 2))
@@ -231,9 +232,9 @@ def _trust(
 
 
 LORA_LEARNING_RATE, FULL_LEARNING_RATE = 0.01, 0.001
-"""Of both factors of every update, and of all weights, of which each output sums hundreds. The paper names none; at a
-tenth of the first 100 steps come as far as 40 do, and the second lowers the loss of a photo as fast as the first does.
-"""
+"""Learning rates of both factors of every LoRA update, and of all weights in full tuning, where each output sums
+hundreds of weights. The paper names none; at a tenth of the first 100 steps come as far as 40 do, and the second lowers
+the loss of a photo as fast as the first does."""
 
 
 def learn_lora(
@@ -244,7 +245,7 @@ def learn_lora(
     Their rank is `config.lora_rank`, or with `config.texture` "full" any.
 
     Args:
-        heads: Of the guess, with what they are asked.
+        heads: Heads of the guess, with what they are asked.
         calibration: Applied to the colours that they put out.
         targets: Pictures of the guess's Gaussians.
         config: Steps and weights.

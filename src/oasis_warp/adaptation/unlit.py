@@ -1,4 +1,4 @@
-"""A photo of a hand as Gaussians draw it, and as its skin is read: without its light."""
+"""Photos without their light: Gaussians as a photo shows them, and the skin as it is read from a photo."""
 
 from typing import NamedTuple
 
@@ -54,21 +54,22 @@ class Unlit(NamedTuple):
     crop: HandCrop
     """As in even light, its mask where the photo surely shows the surface. The photo itself with the light "keep"."""
     light: HandLight | None
-    """Of the photo; None where it is kept."""
+    """Light of the photo; None where it is kept."""
 
 
 def remove_photo_light(
     hand: HandModel, guess: CanonicalGaussians, crop: HandCrop, weights: BlendWeights, config: AdaptConfig
 ) -> Unlit:
-    """Fit the light of one photo and take it off.
+    """Fit the light of one photo and remove it.
 
-    The shaded side of a hand before a dark wall is no wall: reliable pixels are found in a first guess of the light.
+    Reliable pixels are found in a first guess of the light; otherwise the shaded side of a hand would count as the dark
+    wall behind it.
 
     Args:
         hand: The model.
         guess: What the prior makes of the photo.
         crop: The photo.
-        weights: Of `guess` in the photo.
+        weights: Weights of `guess` in the photo.
         config: Options.
     """
 
@@ -89,10 +90,10 @@ def unlit_detail(
     hand: HandModel, gaussians: CanonicalGaussians, crop: HandCrop, weights: BlendWeights, light: HandLight | None,
     *, several: bool = False,
 ) -> tuple[HandCrop, Float[Tensor, "V"]]:  # fmt: skip
-    """What a photo, perhaps a larger one than was adapted to, shows of the skin of `gaussians`, and how far it is skin.
+    """What a photo shows of the skin of `gaussians`, in even light, and its `trust_in_albedo`.
 
-    In even light, and `trust_in_albedo`. The photo itself where no light is apart. Of `several` photos all pixels
-    count: with reliable ones only, a second photo's detail takes less off the error.
+    The photo may be larger than the one that was adapted to. It is returned as it is where no light is separated. With
+    `several` photos all pixels count: with reliable pixels only, a second photo's detail reduces the error less.
     """
     if light is None:
         return crop, crop.rest.vertices.new_ones(len(crop.rest.vertices))

@@ -80,7 +80,7 @@ class SkinTone(NamedTuple):
     log_skin: Float[Tensor, "V 3"]
     """Logarithms of the sRGB colours of skin at the vertices; under nails too."""
     log_nail: Float[Tensor, "3"]
-    """Of a nail's bed through its plate."""
+    """Log colour of a nail's bed, seen through its plate."""
     melanin: float
     """Share on the back."""
 
@@ -88,12 +88,13 @@ class SkinTone(NamedTuple):
 def infer_tone(
     hand: HandModel, guess: Float[Tensor, "V 3"], seen: Float[Tensor, "V 3"], weight: Float[Tensor, "V"]
 ) -> SkinTone:
-    """Mean colours of all regions for the tone of the guess, as the photo shows them.
+    """Mean colours of all regions, for the tone of the guess, as the photo shows them.
 
-    For every tone the gain of each channel is the mean of the logarithms' differences to the guess. What is left, the
-    gain's brightness and its cast are weighed by their expected sizes; the tone is the posterior mean of log melanin.
-    The guess of a learned prior tells it better than the photo's own colours do: light skin in dim light and dark skin
-    in bright light look alike. A photo less colourful than skin is shows all differences of regions less colourful.
+    For every tone the gain of each channel is the mean of the logarithms' differences to the guess. The remaining
+    brightness and cast of the gain are weighed by their expected sizes; the tone is the posterior mean of log melanin.
+    The guess of a learned prior knows the tone better than the photo's own colours: light skin in dim light and dark
+    skin in bright light look alike. In a photo that is less colourful than skin, all differences of regions are less
+    colourful, too.
 
     Args:
         hand: The model.
@@ -146,7 +147,7 @@ def _tone_table() -> tuple[Float[Tensor, "T V 3"], Float[Tensor, "T 3"]]:
 def tone_colors(regions: Regions, melanin: float) -> tuple[Float[Tensor, "V 3"], Float[Tensor, "3"]]:
     """Evenly lit sRGB colours of smooth skin and of nails of a hand whose back has this `melanin` share.
 
-    Palms hold about a third of the melanin of backs, and light ones no less.
+    A palm holds about a third of the melanin of the back, but a light palm holds no less than the back.
     """
     palm, tip, knuckle = regions.palm, regions.finger_tip, regions.knuckle
     palm_melanin = min(0.6 * melanin, 0.006 + 0.33 * melanin)
@@ -178,19 +179,19 @@ def paint_unseen(
 ) -> PaintedSkin:
     """Replace the colours of what was not seen.
 
-    A painted place is exp(t + x + d): the mean colour t of the region in the person's tone (`infer_tone`), what the
-    seen skin differs from it, carried on as the screened membrane x (`inpaint`), and the detail d of real hands
-    (`sample_detail`) with the relief of a back (`relief_shade`). Where the seen skin ends, t + x is its own smooth
-    colour, so that gradients go on and no seam shows. Seen Gaussians stay bit for bit; the largest unseen faces are cut
-    into finer ones.
+    A painted place is exp(t + x + d). The mean colour t is that of the region in the person's tone (`infer_tone`). The
+    membrane x continues the difference of the seen skin from it (`inpaint`). The detail d comes from real hands
+    (`sample_detail`), with the relief of a back (`relief_shade`). Where the seen skin ends, t + x is its own smooth
+    colour, so that gradients continue and no seam shows. Seen Gaussians stay bit for bit; the largest unseen faces are
+    cut into finer ones.
 
     Args:
-        hand: Whose surface it is.
+        hand: Model of the surface.
         gaussians: Fitted to the photos, in even light.
-        guess: Of the prior, before adaptation.
+        guess: Guess of the prior, before adaptation.
         crop: The first photo.
         observations: What the photos show.
-        seed: Of the detail.
+        seed: Seed of the detail.
     """
     rest = crop.rest.vertices
     faces = hand.faces.to(rest.device)
@@ -246,7 +247,7 @@ def _mix(
 
 
 def _unseen_share(hand: HandModel, confidence: Float[Tensor, "V"]) -> Float[Tensor, "V"]:
-    """1 unseen, 0 seen, smooth along the border, all on the side that the photo hardly shows."""
+    """1 unseen, 0 seen, smooth along the border; the border lies on the side that the photo hardly shows."""
     hidden = (1 - confidence / SEEN).clamp(0, 1)[:, None]
     smooth = surface.smooth_over_mesh(hidden, surface.mesh_edges(hand.faces).to(hidden.device), RIM_PASSES)
     return torch.minimum(smooth, (hidden > 0).to(smooth))[:, 0]
@@ -275,9 +276,9 @@ def _nail_color(tone: SkinTone, seen: Tensor, weight: Float[Tensor, "V"], total:
 def _parts(
     hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tensor, "V 3"], invented: Float[Tensor, "V"], seed: int
 ) -> Int[Tensor, "F"]:
-    """Parts an edge: `PARTS` for the unseen faces of one Gaussian with most detail in them, as many as `MORE` allows.
+    """Parts an edge: `PARTS` for the unseen faces of one Gaussian that have most detail, as many as `MORE` allows.
 
-    Where the wrist ends parts would not fade, so that faces stay as they are.
+    Where the wrist ends, parts would not fade, so those faces stay as they are.
     """
     faces = hand.faces.to(rest.device)
     fading = torch.cdist(rest, rest[hand.rim.to(rest.device)]).amin(1) < FADE_REACH * RIM_FADE
@@ -308,10 +309,11 @@ def _skin_detail(detail: SkinDetail, palm: Float[Tensor, "N 1"] | float) -> Floa
 
 
 def _clarity(hand: HandModel, observations: VertexObservations) -> float:
-    """Gain of detail: painted skin beside the smooth skin of a soft or bright photo looks old and dirty.
+    """Gain of detail that suits the photo.
 
-    The root of the ratio of contrasts from vertex to vertex, that of the photo that shows most over `USUAL_CONTRAST`:
-    a third of what tells photos apart here is noise and relief.
+    Detailed skin beside the smooth skin of a soft or bright photo looks old and dirty. The gain is the root of the
+    ratio of contrasts from vertex to vertex: that of the photo which shows most, over `USUAL_CONTRAST`. A third of what
+    differs between photos here is noise and relief.
     """
     best = int(observations.confidence.sum(1).argmax())
     edges = surface.mesh_edges(hand.faces).to(observations.colors.device)

@@ -37,7 +37,7 @@ class Densified(NamedTuple):
     gaussians: CanonicalGaussians
     """Those on faces that are not cut stay bit for bit and in their order; the parts' own are the last."""
     changed: Bool[Tensor, "N"]
-    """Which are new, or sunk under new ones."""
+    """Whether each Gaussian is new, or sunk under new ones."""
     n_new: int
     """How many are new."""
 
@@ -45,7 +45,7 @@ class Densified(NamedTuple):
 def parts_for_spacing(
     vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], spacing: Float[Tensor, "F"]
 ) -> Int[Tensor, "F"]:
-    """Parts an edge that faces are to be cut into, so that a part is at most `spacing` [m] squared; 1 where it is."""
+    """Parts an edge into which each face is cut, so that a part is at most `spacing` [m] squared; 1 for no cut."""
     _, areas = surface.face_normals(vertices, faces)
     return (areas.sqrt() / spacing).ceil().clamp_min(1).long()
 
@@ -61,14 +61,14 @@ def densify(
     """Replace the Gaussians on some faces by finer ones that look the same.
 
     A face of n > 1 parts an edge is cut into n^2 triangles of its own shape, each with a Gaussian at its centre. The
-    face's Gaussians go; vertex Gaussians all of whose faces are cut sink and become the ground under the new ones. A
-    new Gaussian has the colour and the shade that the old ones have there together. Faces without a Gaussian, in the
-    fade at the wrist, stay without.
+    face's own Gaussians are removed. Vertex Gaussians whose faces are all cut sink and become the ground under the new
+    ones. A new Gaussian has the colour and the shade that the old ones have there together. Faces without a Gaussian,
+    in the fade at the wrist, stay without.
 
     Args:
         gaussians: On the surface at rest.
-        vertices: Of the surface at rest [m].
-        faces: Of the surface.
+        vertices: Vertices of the surface at rest [m].
+        faces: Faces of the surface.
         parts: An edge, for each face; 1 leaves the face as it is.
         thickness: Least standard deviation of the parts' Gaussians across the surface [m].
     """
@@ -113,7 +113,7 @@ def densify(
 def _face_opacities(gaussians: CanonicalGaussians, faces: Int[Tensor, "F 3"]) -> Tensor:
     """Highest opacity of the Gaussians on each face, 0 where there is none.
 
-    Where no face has any, as in a small photo's hand, what its vertices' Gaussians have.
+    If no face has any, as in the hand of a small photo, the opacity is that of the vertices' Gaussians.
     """
     n_points = len(gaussians.vertex_index)
     if n_points == len(gaussians.opacities):
@@ -127,14 +127,14 @@ def _face_opacities(gaussians: CanonicalGaussians, faces: Int[Tensor, "F 3"]) ->
 def _vertex_opacities(
     gaussians: CanonicalGaussians, faces: Int[Tensor, "F 3"], of_faces: Tensor, n_vertices: int
 ) -> Tensor:
-    """Highest opacity around each vertex: a learned prior lets faces cover where the vertices' Gaussians are faint."""
+    """Highest opacity around each vertex; a learned prior covers by faces where the vertices' Gaussians are faint."""
     own = gaussians.opacities[: len(gaussians.vertex_index)]
     opacity = own.new_zeros(n_vertices).index_copy(0, gaussians.vertex_index, own)
     return opacity.scatter_reduce_(0, faces.flatten(), of_faces.repeat_interleave(3), "amax")
 
 
 def _inside(cut: Bool[Tensor, "F"], faces: Tensor, n_vertices: int) -> Bool[Tensor, "V"]:
-    """Vertices all of whose faces are cut."""
+    """Whether all faces of a vertex are cut."""
     whole = torch.zeros(n_vertices, dtype=torch.bool, device=faces.device)
     whole[faces[~cut].flatten()] = True
     return ~whole
@@ -154,7 +154,7 @@ def _cut(parts: Tensor, cut: Tensor, dtype: torch.dtype) -> tuple[Int[Tensor, "M
 
 @functools.cache
 def part_centers(n: int) -> Float[Tensor, "P 3"]:
-    """Barycentrics of the centres of the n^2 parts of a face: those that stand like it, then those upside down."""
+    """Barycentrics of the centres of the n^2 parts of a face, the upright parts first."""
     i, j = torch.meshgrid(torch.arange(n), torch.arange(n), indexing="ij")
     upright, turned = i + j < n, i + j < n - 1
     first = torch.cat([i[upright] + 1 / 3, i[turned] + 2 / 3]) / n
@@ -193,8 +193,8 @@ def coarsen(hand: HandModel, gaussians: CanonicalGaussians, rest: PosedHand) -> 
     """A third of the Gaussians: wider ones on the vertices alone, in the colours that all have there together.
 
     Args:
-        hand: Whose surface it is.
-        gaussians: Of vertices and faces, on `rest`, without shade.
+        hand: Model of the surface.
+        gaussians: Gaussians of vertices and faces, on `rest`, without shade.
         rest: The surface at rest.
     """
     anchors = place_anchors(hand, rest)

@@ -36,17 +36,17 @@ MIN_COLOR = 1e-3
 
 
 class SurfaceLight(NamedTuple):
-    """Light, and what of the surface it falls on does not depend on the pose."""
+    """A light, and the properties of the lit surface that do not depend on the pose."""
 
     light: HandLight
     normals: Float[Tensor, "V 3"]
-    """Of the surface at rest, unit; the wrist's rim has that of its closed end."""
+    """Unit normals of the surface at rest; the wrist's rim has the normal of its closed end."""
     seen: Float[Tensor, "V"] | None = None
     """Share of the sky that each vertex saw in the photo; None where no shade depends on it."""
 
 
 class Lighting(NamedTuple):
-    """Of the vertices of posed surfaces."""
+    """Normals and sky exposure of the vertices of posed surfaces."""
 
     normals: Float[Tensor, "*B V 3"]
     """Unit, in the world of the photo's camera."""
@@ -57,9 +57,10 @@ class Lighting(NamedTuple):
 def posed_lighting(
     rest: Float[Tensor, "V 3"], posed: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], light: HandLight
 ) -> Lighting:
-    """The vertices of a posed surface in `light`; normals are those of the rest surface, rotated as Gaussians are.
+    """`Lighting` of a posed surface in `light`; its normals are those at rest, rotated as Gaussians are.
 
-    On the rim of the wrist they are those of its end, to which Gaussians are bound: its sides would shade it in wedges.
+    On the rim of the wrist the normals are those of the wrist's end, to which Gaussians are bound. The normals of its
+    sides would shade it in wedges.
     """
     vertex_quats = face_rotations(rest, posed, faces, validate=False).vertex_quats
     return lighting(posed, vertex_quats, surface.closed_normals(rest, faces), light)
@@ -84,16 +85,16 @@ def with_photo(
     return SurfaceLight(light, normals, None if seen is None else seen[..., 0])
 
 
-def hidden_by_hand(
+def with_self_occlusion(
     light: HandLight,
     albedo: Float[Tensor, "3"],
     rest: Float[Tensor, "V 3"],
     photo: Float[Tensor, "V 3"],
     faces: Int[Tensor, "F 3"],
 ) -> HandLight:
-    """A light that was fitted without what the hand hides of it, with that; the photo's own view stays as it is.
+    """Add to a light what the hand hides of it, for a light that was fitted without.
 
-    There the shade makes up for what is hidden, and elsewhere it goes.
+    The photo's own view stays as it is: there the shade makes up for what is hidden. Elsewhere the shade goes.
     """
     hidden = light._replace(albedo=albedo)
     on = posed_lighting(rest, photo, faces, hidden)
@@ -113,12 +114,12 @@ def shading(light: HandLight, on: Lighting) -> Float[Tensor, "*B V 3"]:
     return received.pow(1 / GAMMA)
 
 
-def shares_that_stay(light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | None) -> Float[Tensor, "*B V 2"]:
-    """Shares of deep and of weak shade that are left on vertices which saw so much of the sky in the photo.
+def remaining_shade(light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | None) -> Float[Tensor, "*B V 2"]:
+    """Shares of deep and of weak shade that stay on vertices which saw this share of the sky in the photo.
 
-    For deep shade what has opened of the sky is the largest nearby. Beside the outline of a finger the palm behind sees
-    most of the sky, with the finger or without; what is much darker or brighter there is that finger, or its shadow.
-    Where the photo is in doubt weak shade may be that finger, too.
+    For deep shade the change of the sky is the largest one nearby. Beside the outline of a finger the palm behind sees
+    most of the sky, with the finger or without; what is much darker or brighter there is the finger or its shadow.
+    Where the photo is in doubt, weak shade may be the finger, too.
     """
     assert light.facing is not None, "comes with any shade"
     cosine = (on.normals * light.facing).sum(-1, keepdim=True)
@@ -139,11 +140,11 @@ def shading_factors(
     on: Lighting,
     seen: Float[Tensor, "V"] | None = None,
 ) -> Float[Tensor, "*B N 3"]:
-    """What `light` multiplies the colours of Gaussians with; in the photo itself without `seen`."""
+    """Factors by which `light` multiplies the colours of Gaussians; without `seen` those in the photo itself."""
     of_vertices = shading(light, on)
     if light.facing is None:
         return _at_gaussians(of_vertices, faces, canonical)
-    stays = shares_that_stay(light, on, seen)
+    stays = remaining_shade(light, on, seen)
     if light.shade is not None:  # all of it is of pixels beside outlines
         of_vertices = of_vertices * (1 + stays[..., :1] * (light.shade - 1))
     if canonical.shade is None:
@@ -169,7 +170,7 @@ def in_even_light(canonical: CanonicalGaussians, light: HandLight) -> CanonicalG
 
 
 def with_shade_baked(canonical: CanonicalGaussians) -> CanonicalGaussians:
-    """The same with shade for colour: what the photo shows, without its light."""
+    """The same with shade multiplied into the colours: what the photo shows, without its light."""
     if canonical.shade is None:
         return canonical
     return canonical._replace(colors=canonical.colors * canonical.shade, shade=None)
@@ -178,7 +179,7 @@ def with_shade_baked(canonical: CanonicalGaussians) -> CanonicalGaussians:
 def split_shade(
     shown: Float[Tensor, "M 3"], shade: Float[Tensor, "M 3"]
 ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
-    """Colours and shade that come to `shown` together; where colours would end at 1, with more shade than `shade`."""
+    """Colours and shade whose product is `shown`; where a colour would end at 1, the shade exceeds `shade`."""
     shown = shown.clamp_min(MIN_COLOR)
     colors = (shown / shade).clamp(MIN_COLOR, 1)
     return colors, shown / colors
@@ -190,10 +191,10 @@ def with_photo_colors(
     shown: Float[Tensor, "M 3"],
     trust: Float[Tensor, "M 1"] | None = None,
 ) -> CanonicalGaussians:
-    """The same with other looks of some Gaussians in the photo, in the shade that they have there.
+    """The same, with the colours that the photo shows of some Gaussians, in the shade that these have.
 
-    Of what is new about them a share `trust` becomes colour, all if not given, and the rest shade. With `trust`, what
-    only takes back the shade that they have becomes no colour either.
+    A share `trust` of the change becomes colour, all of it if not given; the rest becomes shade. With `trust`, a change
+    that only undoes the present shade does not become colour either.
     """
     if canonical.shade is None:
         return canonical._replace(colors=canonical.colors.masked_scatter(changed[:, None], shown))
@@ -210,8 +211,8 @@ def with_photo_colors(
     )
 
 
-def turn_light(light: HandLight, rotation: Float[Tensor, "3 3"]) -> HandLight:
-    """The same light in a world that `rotation` leads to."""
+def rotate_light(light: HandLight, rotation: Float[Tensor, "3 3"]) -> HandLight:
+    """The same light after the world is rotated by `rotation`."""
     facing = None if light.facing is None else light.facing @ rotation.T
     directions = sky_directions(rotation.device).directions.to(light.harmonics)
     before, after = (harmonic_basis(d, len(light.harmonics)) for d in (directions, directions @ rotation.T))
@@ -227,11 +228,11 @@ def pose_gaussians(
 ) -> Gaussians:
     """Gaussians that follow the surface from `rest_vertices` to `posed_vertices` (the paper's appendix B.1).
 
-    Face Gaussians keep their barycentrics, turn by the blended rotation of the face's corners and grow with the root
-    of the face's area; vertex Gaussians turn with their vertex and grow with the faces around it together. Values are
-    not checked here: who poses has checked the pose. A surface that is posed many times is given as its `rest_mesh`.
-    With an axis of poses before `posed_vertices`, means, quats and scales have it too, and colours where there is a
-    `light`: they are drawn in it, past what the posed surface hides of it.
+    Face Gaussians keep their barycentrics, rotate by the blended rotation of the face's corners and scale with the root
+    of the face's area. Vertex Gaussians rotate with their vertex and scale with the faces around it together. Values
+    are not checked here: the caller has checked the pose. A surface that is posed many times is given as its
+    `rest_mesh`. If `posed_vertices` have a leading axis of poses, so have means, quats and scales. With a `light`, so
+    have the colours: they are drawn in it, without the part that the posed surface hides.
     """
     means, quats, scales, vertex_quats = pose_mesh_gaussians(
         rest_vertices, posed_vertices, faces, canonical.face_index, canonical.barycentrics, canonical.vertex_index,

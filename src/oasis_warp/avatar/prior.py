@@ -33,7 +33,7 @@ class Prior(Protocol):
 
     @property
     def about(self) -> Mapping[str, str | int]:
-        """Which prior this is, for reports: its name, and what else tells it from others."""
+        """The prior's name and what else tells it from others, for reports."""
         ...
 
     def __call__(self, crop: HandCrop) -> CanonicalGaussians:
@@ -47,7 +47,7 @@ class MeanHand(NamedTuple):
     colors: Float[Tensor, "B V 3"]
     """Evenly lit mean colours at the vertices."""
     log_melanin: Float[Tensor, "B"]
-    """Of the back's melanin share; posterior mean."""
+    """Logarithm of the back's melanin share; posterior mean."""
     log_gain: Float[Tensor, "B 3"]
     """Logarithm of the photo's colours over `colors`, posterior mean."""
 

@@ -49,14 +49,14 @@ class SurfaceQuality(NamedTuple):
 
 @torch.no_grad()
 def assess_surface(hand: HandModel, crop: HandCrop, drawn: Float[Tensor, "S S 3"]) -> SurfaceQuality:
-    """Where the surface is known from the photo, by a first guess that no truth is needed for.
+    """How well the photo shows each place of the surface: a first guess that needs no ground truth.
 
-    Trust in a vertex is the observation's confidence times exp(-|avatar - photo| / TOLERATED). It is handed on along
-    the surface, e times less every REACH: uncertainty is 1 - max_w trust(w) exp(-d(v, w) / REACH), with the
-    distances d along edges, found by one run of Dijkstra's algorithm from all vertices at once.
+    Trust in a vertex is the observation's confidence times exp(-|avatar - photo| / TOLERATED). It spreads along the
+    surface, divided by e every REACH: uncertainty is 1 - max_w trust(w) exp(-d(v, w) / REACH), with the distances d
+    along edges. One run of Dijkstra's algorithm from all vertices at once finds it.
 
     Args:
-        hand: Whose surface it is.
+        hand: Model of the surface.
         crop: The photo.
         drawn: The avatar in the photo's view, over the photo.
     """
@@ -76,12 +76,12 @@ def assess_surface(hand: HandModel, crop: HandCrop, drawn: Float[Tensor, "S S 3"
 
 
 def over_photo(drawn: Render, crop: HandCrop) -> Float[Tensor, "S S 3"]:
-    """What was drawn over black, over the photo instead."""
+    """A picture that was drawn over black, over the photo instead."""
     return drawn.image + (1 - drawn.alpha)[..., None] * crop.image
 
 
 def combine_quality(qualities: Sequence[SurfaceQuality]) -> SurfaceQuality:
-    """How well each vertex is known from several photos: as from the one that says most of it."""
+    """How well each vertex is known from several photos: as from the photo that shows it best."""
     visibility, uncertainty = (torch.stack([quality[k] for quality in qualities]) for k in range(2))
     return SurfaceQuality(visibility.amax(0), uncertainty.amin(0))
 
@@ -110,7 +110,7 @@ def coverage_percent(hand: HandModel, areas: Float[Tensor, "V"], quality: Surfac
 def coverage_of_photos(
     areas: Float[Tensor, "V"], confidence: Float[Tensor, "K V"], share: Float[Tensor, "K V"]
 ) -> list[dict[str, float]]:
-    """Of the surface [%]: what each of K photos shows, and what it shows best of all; see `VertexObservations`."""
+    """Shares of the surface [%] that each of K photos shows, and shows best; see `VertexObservations`."""
     best = (confidence * share).argmax(0)
 
     def percent(where: Tensor) -> float:
@@ -123,7 +123,7 @@ def coverage_of_photos(
 
 
 def coverage_warnings(found: dict[str, float]) -> list[str]:
-    """Warnings about what `coverage_percent` says."""
+    """Warnings about the numbers of `coverage_percent`."""
     if found["seen_percent"] >= LITTLE_SEEN:
         return []
     percent = f"{found['seen_percent']:.0f} %"
@@ -137,7 +137,7 @@ def photo_warnings(image: Float[Tensor, "S S 3"], mask: Float[Tensor, "S S"], si
     Args:
         image: The square crop around the hand.
         mask: Share of each pixel that is hand.
-        side: Of that square in the photo [px].
+        side: Side of that square in the photo [px].
     """
     inside = inner_mask(mask) > 0.5
     if not bool(inside.any()):
@@ -160,7 +160,7 @@ def photo_warnings(image: Float[Tensor, "S S 3"], mask: Float[Tensor, "S S"], si
 def _blur(image: Tensor, mask: Tensor, side: float) -> float:
     """Share of the differences between neighbouring pixels that survives a blur: little where the picture is sharp.
 
-    Along the worse of both axes (Crete et al. 2007, "The blur effect"), at the photo's own size.
+    The share is that of the worse of both axes (Crete et al. 2007, "The blur effect"), at the photo's own size.
     """
     size = min(round(side), BLUR_SIDE, len(image))  # a crop that was made smaller is sharp, not blurred
     planes = torch.cat([(image @ image.new_tensor(LUMA))[None, None], mask[None, None]], 1)

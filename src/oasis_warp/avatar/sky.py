@@ -34,7 +34,7 @@ class SkyMesh(NamedTuple):
     faces: Int[Tensor, "G 3"]
     """Between these."""
     corners: Int[Tensor, "V 3"]
-    """Of the coarse face that lies nearest to each vertex of the hand."""
+    """Corners of the coarse face that lies nearest to each vertex of the hand."""
     weights: Float[Tensor, "V 3"]
     """With which that vertex reads them."""
     vertex_faces: Int[Tensor, "C M"]
@@ -45,7 +45,7 @@ class SkyMesh(NamedTuple):
 
 @functools.cache
 def sky_mesh(device: torch.device) -> SkyMesh:
-    """That of the bundled hand."""
+    """The coarse mesh of the bundled hand."""
     # Kept for all: what is known of its faces is remembered only for tensors made outside of inference.
     with (
         torch.inference_mode(False),

@@ -43,14 +43,14 @@ CAP_SPREAD = 1.9
 
 
 def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tensor, "V 3"]) -> CanonicalGaussians:
-    """The same hand with an end: priors let opacity fade out towards the wrist, because photos show an arm there.
+    """Close the hand at the wrist, where a prior's opacity fades out because photos show an arm there.
 
     Gaussians in the second half of the fade are replaced by opaque ones on every vertex and face; the others become as
-    opaque as they were before the fade. The cap's Gaussians are bound to rim vertices. All have the colours of the
-    nearest Gaussians before the fade, and no shade; that of the others ends before.
+    opaque as they were before the fade. The cap's Gaussians are bound to rim vertices. New Gaussians have the colours
+    of the nearest Gaussians before the fade, and no shade; the shade of the others ends before.
 
     Args:
-        hand: Whose surface it is.
+        hand: Model of the surface.
         gaussians: On `rest`.
         rest: The surface at rest [m].
     """
@@ -89,7 +89,7 @@ def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tens
 
 
 def end_shade(hand: HandModel, light: HandLight, rest: Float[Tensor, "V 3"]) -> HandLight:
-    """`light` whose shade ends before the wrist as that of Gaussians does in `close_wrist`."""
+    """`light` whose shade ends before the wrist, as the shade of Gaussians does in `close_wrist`."""
     return light if light.shade is None else light._replace(shade=light.shade ** _shade_left(hand, rest))
 
 
@@ -103,7 +103,8 @@ def _smoothed(
 ) -> Float[Tensor, "M 3"]:
     """The colours of Gaussians just before the fade, averaged around `points`.
 
-    The wider the farther away these are: with one width the middle of the cap would have wedges, each of one colour.
+    The average is wider where these are farther away. With one width the middle of the cap would have wedges of one
+    colour each.
     """
     on_faces = (rest[faces[gaussians.face_index]] * gaussians.barycentrics[..., None]).sum(1)
     centers = torch.cat([rest[gaussians.vertex_index] + gaussians.offsets, on_faces])

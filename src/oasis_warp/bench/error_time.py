@@ -42,13 +42,13 @@ class SettingRow:
     gaussians: int
     """In the scene."""
     faces: int | None
-    """Of its mesh, where it has one."""
+    """Faces of the scene's mesh, where it has one."""
     op: str
     pass_: str
     """Called `pass` in files: "forward" or "forward + backward"."""
     knob: str
     value: str
-    """Of the knob; "default" for the knob "default"."""
+    """Value of the knob; "default" for the knob "default"."""
     device: str
     threads: int
     median_ms: float
@@ -68,7 +68,7 @@ class SettingRow:
     max_abs: float
     """Largest error of any element of any output, fragile pixels included."""
     psnr_db: float | None
-    """Of the image, fragile pixels included; None where it is equal, or there is none."""
+    """PSNR of the image, fragile pixels included; None where the image is equal, or there is none."""
     gradient_rel_l2: float | None
     """Largest relative error of any gradient, of a loss without the fragile pixels."""
     floor_rel_l2: float
@@ -106,7 +106,7 @@ class Sweep:
     """Scenes, each with the operator to measure on it."""
     device: torch.device
     threads: int = 1
-    """Of the default setting."""
+    """Threads of the default setting."""
     max_threads: int = 1
     repeats: int = 20
     settings: Callable[[str, torch.device, int, int], Sequence[Setting]] = knobs.settings

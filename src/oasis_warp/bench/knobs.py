@@ -55,7 +55,7 @@ class Setting:
     options: Mapping[str, Any] = field(default_factory=dict)
     """Arguments of the operator."""
     share: float = 1.0
-    """Of the Gaussians, those with the largest opacity times area on the surface."""
+    """Share of the Gaussians that is drawn: those with the largest opacity times area on the surface."""
     shrink: int = 1
     """Factor by which each side of the image has fewer pixels."""
     torch: bool = False
@@ -100,7 +100,7 @@ THRESHOLDS = (
     *(Setting("extent", f"{sigmas:g} sigma", Rules(extent_sigmas=sigmas)) for sigmas in (2.0, 2.5, 3.0)),
 )
 EXPONENTIAL = tuple(Setting("exp degree", str(degree), Rules(exp_degree=degree)) for degree in (3, 4))
-"""Of the float32 kernels of the CPU; CUDA computes exponentials in hardware."""
+"""Degrees of the exponential in the CPU's float32 kernels; CUDA computes exponentials in hardware."""
 FLOAT64 = Setting("precision", "float64", dtype=torch.float64)
 TORCH = Setting("torch", "float32", torch=True)
 GENERIC = Setting("generic", "float32", generic=True)

@@ -67,7 +67,7 @@ class Operator:
     image: bool = False
     """Whether the first output is an image in [0, 1]."""
     comparable: Callable[[Outputs], Outputs] = unchanged
-    """Outputs in the form in which errors are taken."""
+    """Outputs in the form that errors are taken of."""
     prepare: Callable[[Any], Any] = unchanged
     """Untimed work on a scene before calls."""
 
@@ -237,7 +237,8 @@ class Exact(NamedTuple):
     """In comparable form."""
     gradients: Outputs
     weights: Outputs = ()
-    """Of the loss whose gradients are taken: random signs in float32, 0 where rounding decides what is drawn."""
+    """Weights of the loss whose gradients are taken: random signs in float32, 0 where rounding decides what is
+    drawn."""
     judged: Tensor | None = None
     """Pixels [C, H, W] where no decision depends on rounding; None where every result counts."""
     comparable: Callable[[Outputs], Outputs] = unchanged

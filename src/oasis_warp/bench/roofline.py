@@ -35,7 +35,7 @@ class Counts:
     gaussians: int
     """Once for each camera."""
     drawn: int
-    """Of these, those whose box contains a pixel."""
+    """Gaussians whose box contains a pixel."""
     box_pixels: int
     """In all boxes together."""
     pairs: int
@@ -218,7 +218,7 @@ class Ceilings:
     gb_s: float
     """Bytes read and written by a copy of 1 GiB [GB/s]."""
     gflop_s: float
-    """Of a product of float32 matrices, without TF32 [GFLOP/s]."""
+    """Rate of a product of float32 matrices, without TF32 [GFLOP/s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -230,16 +230,16 @@ class KernelRow:
     launches: float
     """In a call."""
     us: float
-    """Of all of them, in a call."""
+    """Time of all launches of a call, together."""
     bytes: float | None
-    """That it must move; None where there is no formula for the kernel, as in what follows from it."""
+    """Bytes that the kernel must move. This and all that follows from it is None where the kernel has no formula."""
     flops: float | None
     gb_s: float | None
     gflop_s: float | None
     floor_us: float | None
     """What it would take at the nearer ceiling."""
     bound: str
-    """Which ceiling that is: "bytes" or "flops"; "" without a formula."""
+    """The nearer ceiling: "bytes" or "flops"; "" without a formula."""
     ceiling_gb_s: float
     ceiling_gflop_s: float
     device: str
@@ -248,7 +248,7 @@ class KernelRow:
 
     @property
     def share(self) -> float | None:
-        """Of the nearer ceiling."""
+        """Share of the nearer ceiling that the kernel reaches."""
         return None if self.floor_us is None else self.floor_us / self.us
 
 
@@ -264,10 +264,10 @@ def assess(
 
     Args:
         case: What it is called.
-        times: Of its kernels, the longest first.
+        times: Times of its kernels, the longest first.
         models: Formulas, by the kernel's name.
         counts: What they count from.
-        ceilings: Of the GPU.
+        ceilings: Ceilings of the GPU.
         about: device, commit and versions.
     """
     rows = []
@@ -349,7 +349,7 @@ def measure_roofline(device: torch.device, seed: int = 0, progress: Progress = s
 
     Args:
         device: A CUDA device.
-        seed: Of the scenes.
+        seed: Seed of the scenes.
         progress: Called after every case.
     """
     ceilings = measure_ceilings(device)

@@ -57,12 +57,12 @@ class ScalingRow:
     width: int
     height: int
     pairs: int
-    """Of a Gaussian and a tile of 8 x 8 pixels."""
+    """Pairs of a Gaussian and a tile of 8 x 8 pixels."""
     longest: int
     """List of a tile."""
     wall_ms: float
     busy_ms: float | None
-    """Of the GPU, by a CUDA graph; None where there is none."""
+    """GPU time, measured by a CUDA graph; None where there is none."""
     peak_mb: float | None
     """Memory beyond what was in use before the call [MiB]."""
     finite: bool
@@ -88,7 +88,7 @@ class ScalingRow:
 
     @property
     def cost_ms(self) -> float:
-        """Of the GPU where it was measured, else on the host's clock."""
+        """GPU time where it was measured, else time on the host's clock."""
         return self.wall_ms if self.busy_ms is None else self.busy_ms
 
 
@@ -123,10 +123,10 @@ def measure_scaling(
     """Two rows per point, a forward pass and one with a backward pass.
 
     Args:
-        chosen: Of `points`.
+        chosen: Points of `points` to measure.
         device: Where to compute.
         seconds: Limit for timing a point; slow calls are timed in fewer groups.
-        seed: Of the scenes.
+        seed: Seed of the scenes.
         progress: Called after every point.
     """
     rows: list[ScalingRow] = []

@@ -112,10 +112,10 @@ class MeshScene(TensorBundle):
     area_ratio: Float[Tensor, "F"]
     vertex_area_ratio: Float[Tensor, "V"]
     covars: Float[Tensor, "V 3 3"]
-    """Of a Gaussian at each vertex [m^2]."""
+    """Covariance of a Gaussian at each vertex [m^2]."""
     skin_weights: Float[Tensor, "V J"]
     transforms: Float[Tensor, "J 3 4"]
-    """Of the bones, rest to posed."""
+    """Transforms of the bones, rest to posed."""
     points: Float[Tensor, "V 3"]
     """To score by visibility: the posed vertices, moved at random."""
     vertex_index: Int[Tensor, "P"]
@@ -299,7 +299,7 @@ def surface(n: int, size: int = 512, n_views: int = 1, seed: int = 0) -> Gaussia
         n: Gaussians.
         size: Side of the pictures [px].
         n_views: Cameras, all round.
-        seed: Of positions, sizes and colours.
+        seed: Seed of positions, sizes and colours.
     """
     generator = torch.Generator().manual_seed(seed)
     hand, _, _, posed, _ = hand_parts(generator)

@@ -49,7 +49,7 @@ class SpeedRow:
     gaussians: int
     """In the scene."""
     faces: int | None
-    """Of its mesh, where it has one."""
+    """Faces of the scene's mesh, where it has one."""
     width: int
     height: int
     device: str
@@ -58,7 +58,7 @@ class SpeedRow:
     iqr_ms: float
     fastest_ms: float
     cpu_ms: float | None
-    """Of all threads, in the call with the least; None on CUDA."""
+    """CPU time of all threads, in the call with the least; None on CUDA."""
     first_ms: float
     repeats: int
     peak_mb: float | None
@@ -103,11 +103,11 @@ def measure_operators(
     """Rows of every backend of the `operators`, those of an operator timed in turns.
 
     Args:
-        operators: Of `OPERATORS`.
+        operators: Entries of `OPERATORS`.
         options: Device, threads and repeats.
-        gaussians: Of the hand, to draw.
+        gaussians: Number of Gaussians of the hand to draw.
         size: Side of the image [px].
-        seed: Of the scene.
+        seed: Seed of the scene.
         progress: Called after every round.
     """
     drawn, mesh = surfels(gaussians, size, seed), hand_scenes(size, seed)[1]
@@ -168,7 +168,7 @@ class GpuRow:
     """On the host's clock, with one wait after many calls."""
     wall_iqr_ms: float
     busy_ms: float | None
-    """Of the GPU, by a CUDA graph that holds ten calls; None where there is no graph."""
+    """GPU time, measured by a CUDA graph that holds ten calls; None where there is no graph."""
     busy_iqr_ms: float | None
     launch_ms: float | None
     """The same by a graph of one call: with the launch of a graph, as a program that waits for nothing has it."""
@@ -232,8 +232,8 @@ def measure_cases(
     Args:
         cases: What to time.
         device: Where; on the CPU there are no graphs, and host times only.
-        groups: Of calls, at least 2; medians are over them.
-        seed: Of the scenes.
+        groups: Groups of calls, at least 2; medians are over them.
+        seed: Seed of the scenes.
         peers: Other rasterizers, by name.
         progress: Called after every case.
     """
@@ -317,7 +317,7 @@ def median(sample: Sample | None) -> float | None:
 
 
 def repeats_bits(implementation: Implementation, captured: Captured[Results] | None, found: Results) -> bool:
-    """Whether another call gives the bits of `found`, and a replay of the graph, whose lists do not overflow."""
+    """Whether another call, and a replay of the graph whose lists do not overflow, give the bits of `found`."""
     equal = same_bits(found.tensors, implementation.run().tensors)
     if captured is None:
         return equal

@@ -156,7 +156,7 @@ def roofline_table(rows: Sequence[KernelRow]) -> Table:
 
 
 UNITS = {"gaussians": ("Gaussian", 1e6, "ns"), "pixels": ("pixel", 1e6, "ns"), "views": ("view", 1e3, "us")}
-"""Of an axis: what it counts, and how milliseconds for one of them are written."""
+"""What each axis counts, and how milliseconds for one of them are written."""
 MARKS = {"forward": "o", "forward + backward": "s"}
 DPI = 110
 ERROR_LABELS = {"forward": "error of values", "forward + backward": "error of values and gradients"}
@@ -191,7 +191,7 @@ def plot_operator(rows: Sequence[SettingRow], op: str, path: Path, scenes: Seque
     results are known: smaller errors are drawn on it. Time is `SettingRow.cost_ms`.
 
     Args:
-        rows: Of `oasis bench error-time`.
+        rows: Rows of `oasis bench error-time`.
         op: The operator to draw.
         path: The picture to write; its suffix says the format.
         scenes: Those to draw; all when None.

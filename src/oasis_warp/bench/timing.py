@@ -94,7 +94,7 @@ class Timed:
     threads: int
     """CPU threads that torch and our kernels may use."""
     around: Callable[[], AbstractContextManager[object]] = nullcontext
-    """A context for the call, whose own time does not count."""
+    """A context for the call; its own time does not count."""
 
     @contextmanager
     def ready(self) -> Iterator[None]:
@@ -206,7 +206,7 @@ def time_groups(probes: Sequence[Probe], groups: int, seconds: float | None = No
 
     Args:
         probes: What to time; each is warmed up first.
-        groups: Of each probe; at least 2.
+        groups: Groups of calls of each probe; at least 2.
         seconds: Limit for all groups together: slow calls are made once a group, and in fewer groups.
     """
     if groups < 2:
@@ -296,7 +296,7 @@ class Captured(Generic[Result]):
     graph: Any
     calls: int
     results: Result
-    """Of the last call, new after every replay."""
+    """Results of the last call, new after every replay."""
     overflow: Overflow
     """Whether a replay met more pairs of a Gaussian and a tile than the graph has memory for."""
 
@@ -355,7 +355,7 @@ class KernelTime:
     launches: float
     """In a call."""
     us: float
-    """Of all its launches in a call, together."""
+    """Time of all its launches in a call, together."""
 
 
 def short_name(name: str) -> str:

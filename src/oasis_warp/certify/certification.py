@@ -328,7 +328,7 @@ def bit_differences(
 
 
 def refusals(family: Family, case: Case, device: torch.device) -> list[Measurement]:
-    """Which bad calls are not refused by a ValueError that begins with the argument's name."""
+    """A row for each bad call: 1 where no ValueError that begins with the argument's name refuses it."""
     good = case.arguments(torch.float32, device)
     return [
         Measurement(

@@ -17,7 +17,7 @@ LAYER = 6e-3
 NEARLY = 2e-5
 """Difference of two pixels that rounding explains, over the largest element."""
 SHARE = 1e-4
-"""Of elements that may differ by more: those where rounding decides what is drawn."""
+"""Share of elements that may differ by more: those where rounding decides what is drawn."""
 CPU = torch.device("cpu")
 
 
@@ -67,7 +67,7 @@ def loss_weights(case: Case, outputs: Outputs, mask: Outputs) -> list[list[Tenso
 
 
 def gradients(case: Case, arguments: dict[str, Any], outputs: Outputs, weights: list[list[Tensor]]) -> list[dict]:
-    """Of the weighted sums of the outputs, by input; zeros where the outputs do not depend on one."""
+    """Gradients of the weighted sums of the outputs, by input; zeros where the outputs do not depend on one."""
     inputs = [arguments[name] for name in case.differentiable]
     taken = []
     for signs in weights if inputs else []:

@@ -16,7 +16,7 @@ from oasis_warp.reference import posing, rasterization, visibility
 Outputs = tuple[Tensor, ...]
 Arguments = dict[str, Any]
 ALL = torch.ones((), dtype=torch.float64)
-"""The mask of an output of which every element counts."""
+"""The mask of an output whose elements all count."""
 SIGN_TIE = 1e-5
 """Dot product of two quaternions below which rounding may decide the sign of one."""
 LARGE_MESH = {"n": 1500, "size": (160, 120)}

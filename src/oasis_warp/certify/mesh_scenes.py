@@ -83,7 +83,7 @@ def duplicated_and_flipped(rng: Sampler, n: int) -> Mesh:
 
 
 def folded(rng: Sampler, n: int) -> Mesh:
-    """Two faces, of which the second lies exactly on the first, turned over."""
+    """Two faces; the second lies exactly on the first, turned over."""
     vertices, _ = plane(1, 1.5, 2.5)
     return Mesh(torch.cat([vertices, vertices[:1]]), torch.tensor([[0, 1, 3], [3, 1, 4]]))
 
@@ -144,7 +144,7 @@ CONDITIONS: dict[str, Callable[[Sampler, int], Mesh]] = {
 
 
 def before_camera(rng: Sampler, mesh: Mesh, size: tuple[int, int]) -> tuple[dict[str, Tensor], dict]:
-    """Float arguments and other arguments; one in four is a batch of two, of which the second differs a little."""
+    """Float arguments and other arguments; one in four is a batch of two, and its second entry differs a little."""
     width, height = size
     viewmat = torch.eye(4, dtype=torch.float64)
     if mesh.turned:

@@ -112,7 +112,7 @@ def work(client: Any, tasks: Sequence[Sequence[str]], order: Order, report: Call
     """Run all tasks; the number of photos that were processed now, not found done.
 
     Args:
-        client: Of Dask.
+        client: Client of Dask.
         tasks: Names of photos.
         order: What to make of them.
         report: Called with the numbers of photos so far that were worked on, and that were found done.

@@ -90,7 +90,7 @@ def make_avatars(
     """Make avatars of photos, one after the other; how many were made, refused, failed, and kept from before.
 
     Args:
-        names: Of the photos' files, relative to `order.source`; also an array of them, as Ray gives.
+        names: Names of the photos' files, relative to `order.source`; also an array of them, as Ray gives.
         order: What to make of them.
         tell: Called with the counts so far after each photo.
 

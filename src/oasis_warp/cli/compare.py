@@ -23,7 +23,7 @@ from oasis_warp.hand_avatar import Avatar
 VIEWS = (("photo", 0.0), ("photo", math.pi), ("fist", 0.0))
 """Poses, and directions to see them from [rad]."""
 WIDTH, MAGNIFIED = 1200, 4.0
-"""Of the sheet [px], and of the differences on it."""
+"""Width of the sheet [px], and the factor by which it magnifies differences."""
 
 
 def run(options: Compare) -> int:

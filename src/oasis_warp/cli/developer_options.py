@@ -61,7 +61,7 @@ class ErrorTime:
     size: int = 256
     """Side of the pictures of the hand [px]; a multiple of 4."""
     seed: int = 0
-    """Of the scenes and the gradients' weights."""
+    """Seed of the scenes and the gradients' weights."""
     device: Device = "cpu"
     threads: int = 1
     """CPU threads of the default setting; the knob "threads" tries other numbers up to that of the cores."""
@@ -107,7 +107,7 @@ class Scaling:
     seconds: float | None = None
     """For timing each point: 2 when not given, 1 with --quick."""
     seed: int = 0
-    """Of the scenes."""
+    """Seed of the scenes."""
     device: Device = "cpu"
     threads: Threads = 1
 
@@ -121,7 +121,7 @@ class Roofline:
     plot: Path | None = None
     """Picture: .png or .svg; needs matplotlib."""
     seed: int = 0
-    """Of the scenes."""
+    """Seed of the scenes."""
     device: Literal["cuda"] = "cuda"
     """Where to compute."""
 
@@ -159,7 +159,7 @@ class Synthesize:
     count: int = 64
     """How many pictures; eight in a row show one person."""
     seed: int = 0
-    """Of the world: picture k of a seed is always the same, whatever the count."""
+    """Seed of the world: picture k of a seed is always the same, whatever the count."""
     size: int = 256
     """Side of the pictures [px]."""
     look: Literal["photo", "even"] = "photo"
@@ -208,10 +208,10 @@ class Pretrain:
     size: int = 256
     """Side of photos and targets [px], a multiple of 16."""
     seed: int = 0
-    """Of the weights, the people, the pictures and the estimator's errors."""
+    """Seed of the weights, the people, the pictures and the estimator's errors."""
     device: Device = "cuda"
     precision: Literal["bf16", "float32"] = "bf16"
-    """Of attention and perceptrons; all else is float32."""
+    """Precision of attention and perceptrons; all else is float32."""
     workers: int = 8
     """Processes that bake people and plan pictures ahead, for each GPU; 0 for none."""
     backbone_weights: Path | None = None
@@ -259,7 +259,7 @@ class Evaluate:
     size: int = 256
     """Side of the pictures [px]; a multiple of 16 for synthetic ones, and 256 for looks."""
     seed: int = 0
-    """Of people, pictures and adaptation."""
+    """Seed of people, pictures and adaptation."""
     lpips: LpipsWeights = None
     allow_download: AllowDownload = False
     device: Device = "cpu"

@@ -57,7 +57,7 @@ AVATARS_PER_PHOTO = 4
 """Avatars made of each photo for pairs: without the learned prior, and with it in each of three lights."""
 PUBLISHED = ("interhand", "hanco", "coco-hand", "whim")
 TABLE_WIDTH = 120
-"""Of tables where there is no terminal, or a narrow one [characters]."""
+"""Width of tables where there is no terminal, or a narrow one [characters]."""
 
 
 def run(options: Evaluate) -> int:

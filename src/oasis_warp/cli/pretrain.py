@@ -41,9 +41,9 @@ SETTINGS, PEOPLE = "training.json", "people"
 """Names in the folder: the settings of the training, and the folder of people baked on a CPU."""
 PRECISIONS = {"bf16": "bfloat16", "float32": "float32"}
 DENSE_SCHEDULE: dict[str, Any] = {"learning_rate": 1e-3, "warmup": 300, "decay": "cooldown"}
-"""Of the dense network's training; a cooldown lets a training go on from weights before it."""
+"""Schedule of the dense network's training; a cooldown lets a training go on from weights before it."""
 SHOWN_REASONS = 5
-"""Of samples that were left out; evaluation and Python give all."""
+"""Number of reasons that are printed for samples left out; evaluation and Python give all."""
 AHEAD = 4
 """Batches that a GPU renders together."""
 SIZES = range(32, 1025, MULTIPLE)

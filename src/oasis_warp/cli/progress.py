@@ -74,7 +74,7 @@ EDIT_PLAN = (
     Step("kernels", 0.05, once=True), Step("difference", 0.05), Step("registration", 1.5), Step("colours", 3.0),
     Step("paint", 0.02), Step("summary", 1.0),
 )  # fmt: skip
-"""Of `edit`, a spot of 2 cm² on a photo of the tests, measured as that of `reconstruct`."""
+"""Steps of `edit` with their seconds for a spot of 2 cm² on a photo of the tests, measured as for `reconstruct`."""
 
 
 class Run:
@@ -147,7 +147,7 @@ class Run:
 
     @property
     def share(self) -> float:
-        """Of the whole run that is done, 0 to 1; within a step, as far as its time has passed."""
+        """Share of the whole run that is done, 0 to 1; within a step, as far as its time has passed."""
         done, here, pace = self._work()
         now = done + min((self._clock() - self._since) / pace, NEARLY * here)
         self._shown = max(self._shown, now / self._total if self._total else 1.0)  # bars do not go back
@@ -193,7 +193,7 @@ class ManyPhotos(Run):
 
     @property
     def share(self) -> float:
-        """Of the photos that are done, 0 to 1."""
+        """Share of the photos that are done, 0 to 1."""
         self._shown = max(self._shown, self._ready / self._n)
         return self._shown
 

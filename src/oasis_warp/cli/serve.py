@@ -12,7 +12,7 @@ from oasis_warp.cli.view import serve
 from oasis_warp.core.errors import InputError
 
 MAX_BYTES, MAX_DIGITS = 64 << 20, 20
-"""Of a photo, and of the number that says so: Python reads none of more than 4300 digits."""
+"""Largest photo, and most digits of a Content-Length: Python reads no number of more than 4300 digits."""
 FORM = {"": "form.html", "form.css": "form.css", "form.js": "form.js"}
 TYPES = {
     ".html": "text/html; charset=utf-8", ".css": "text/css; charset=utf-8", ".js": "text/javascript; charset=utf-8",

@@ -18,7 +18,7 @@ def project(camera: Camera, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor,
 
 ORBIT_FIELD_OF_VIEW = math.radians(30)
 ORBIT_MARGIN = 1.08
-"""Of the distance at which the hand's bounding sphere just fills the picture."""
+"""Distance of the camera, in units of the distance at which the hand's bounding sphere just fills the picture."""
 
 
 def crop_camera(camera: Camera, left: float, top: float, side: float, size: int) -> Camera:

@@ -29,28 +29,28 @@ class AdaptConfig:
     as in the paper, low-rank updates of the heads of a learned prior, from its calibrated guess on; or, as in its
     ablation, all weights of these heads."""
     lora_rank: int = 8
-    """Of those updates."""
+    """Rank of those updates."""
     texture_steps: int | None = None
     """Steps of texture learning, which "even" does without; None stops when the loss is flat, after 400 at most."""
     weight_rgb: float = 10.0
-    """Of the mean absolute colour difference."""
+    """Weight of the mean absolute colour difference."""
     weight_ssim: float = 1.0
-    """Of 1 - SSIM."""
+    """Weight of 1 - SSIM."""
     weight_perceptual: float = 5.0
-    """Of LPIPS, where a network for it is given."""
+    """Weight of LPIPS, where a network for it is given."""
     weight_mean: float = 20.0
-    """Of the difference of the masked mean colours, in calibration."""
+    """Weight of the difference of the masked mean colours, in calibration."""
     weight_std: float = 1.0
-    """Of the difference of the masked standard deviations, in calibration."""
+    """Weight of the difference of the masked standard deviations, in calibration."""
     weight_reference: float = 0.25
-    """Of the reference views, which hold the rest of the hand where the prior put it."""
+    """Weight of the reference views, which hold the rest of the hand where the prior put it."""
     reference_views: int = 7
     """Views around the hand, 360 / (n + 1) degrees apart, the photo's own left out."""
     references: Literal["in_turn", "all"] = "in_turn"
     """One reference view a step, by its colour difference and for all of them; or all in every step, by the same
     loss as the photo, as in the paper."""
     seed: int = 0
-    """Of the order of the reference views, and of LoRA's start."""
+    """Seed of the order of the reference views, and of LoRA's start."""
 
 
 PAPER_ADAPTATION = AdaptConfig(
@@ -64,7 +64,7 @@ class ReconstructConfig:
     """From a photo to an avatar."""
 
     hand: Literal["left", "right", "largest"] | int = "largest"
-    """Which hand of the photo: a side, the largest, or a number from 0 for the best found, 1 for the next."""
+    """The hand of the photo to use: a side, the largest, or a number from 0 for the best found, 1 for the next."""
     prior: Literal["learned", "none"] | Path = "learned"
     """What to assume of the hand before the photo is fitted: what the bundled network sees in the photo, only mean
     colours in its skin tone, or what your own network sees: network.safetensors of `oasis pretrain`."""

@@ -21,11 +21,11 @@ from scipy import sparse
 from oasis_warp.core.errors import InputError, shortened
 
 MAX_BYTES = 256 << 20
-"""Of a file: MANO's have 4 MB, an estimator's a few for each hand."""
+"""Largest file: MANO's have 4 MB, an estimator's a few for each hand."""
 MAX_INSTRUCTIONS = 2_000_000
 """A million of them take about two seconds."""
 MAX_DIMENSIONS, MAX_NESTED = 8, 20
-"""Of an array, and of arrays that name other arrays."""
+"""Most dimensions of an array, and deepest nesting of arrays that name other arrays."""
 _NUMBER = re.compile(r"[<>=|]?[fiub][1248]")
 
 
@@ -87,7 +87,7 @@ def read_npz(path: Path, names: Container[str] | None = None, content: bytes | N
 
     Args:
         path: The file.
-        names: Of those that are read; all when not given.
+        names: Names that are read; all when not given.
         content: Its bytes, where they lie elsewhere; `path` is for messages then.
 
     Raises:

@@ -23,7 +23,7 @@ class Published(NamedTuple):
     megabytes: int
     """About; said before a download."""
     sha256: str
-    """Of the whole file."""
+    """Digest of the whole file."""
 
 
 _HUB, _TORCH = "https://huggingface.co/facebook", "https://download.pytorch.org/models"

@@ -42,7 +42,7 @@ class Landmarks(NamedTuple):
     presence: float
     """The network's probability that there is a hand, 0 to 1."""
     source: str
-    """Which way found it: "network", "network (margin)", "file" ..."""
+    """How it was found: "network", "network (margin)", "file" ..."""
 
 
 class Camera(NamedTuple):
@@ -76,7 +76,7 @@ class PosedHand(NamedTuple):
 
 
 class SurfaceReading(NamedTuple):
-    """Which place of the hand each pixel around it shows, as a network reads the photo; a square of R x R samples."""
+    """The place on the hand that each pixel shows, as a network reads the photo; a square of R x R samples."""
 
     places: Float[Tensor, "R R 3"]
     """On the bundled hand at rest [m]."""
@@ -85,7 +85,7 @@ class SurfaceReading(NamedTuple):
     left: float
     top: float
     side: float
-    """Of the square [px of the photo]."""
+    """Side of the square [px of the photo]."""
 
 
 class HandFit(NamedTuple):
@@ -105,9 +105,9 @@ class HandFit(NamedTuple):
     worst_point: float
     """Largest of those distances [%]."""
     mask_iou: float
-    """Of the posed mesh and the mask, above the wrist."""
+    """Intersection over union of the posed mesh and the mask, above the wrist."""
     cost: float
-    """Of the least-squares fit; sums squared residuals in units of their sigmas."""
+    """Cost of the least-squares fit: the sum of squared residuals in units of their sigmas."""
     warnings: tuple[str, ...]
     """What makes this fit doubtful, in words; empty when nothing does."""
     reading: SurfaceReading | None = None
@@ -124,7 +124,7 @@ class HandCrop(NamedTuple):
     above_wrist: Float[Tensor, "S S"]
     """1 on the hand's side of the wrist line: below it mask and surface end at different places."""
     camera: Camera
-    """Of the crop."""
+    """Camera of the crop."""
     rest: PosedHand
     """The fitted surface at rest."""
     posed: PosedHand
@@ -172,10 +172,10 @@ class Render(NamedTuple):
 class HandLight(NamedTuple):
     """Light that falls on a hand; it stays in the world when the hand turns.
 
-    The light that skin reflects is multiplied with the harmonics in the direction n in which it faces, in the world of
-    the photo's camera, kept within `limits`; and with the share of it that the hand lets through in its pose
-    (`avatar.sky`). What that does not tell, gloss and wrinkles, stays on skin for as long as it faces as in the photo
-    and sees as much of the sky: `shade` here and that of the Gaussians.
+    Colours are multiplied, as light, with the harmonics in the direction n that the skin faces, in the world of the
+    photo's camera, kept within `limits`; and with the share of this light that the hand lets through in its pose
+    (`avatar.sky`). What this does not explain, such as gloss and wrinkles, is shade: `shade` here and that of the
+    Gaussians. It stays on skin as long as the skin faces as in the photo and sees as much of the sky.
     """
 
     harmonics: Float[Tensor, "K 3"]
@@ -195,23 +195,23 @@ class HandLight(NamedTuple):
 
 
 class TrainingBatch(NamedTuple):
-    """B hands, each as one photo shows it and as T pictures must come out: what a prior is trained on.
+    """B hands, each with one photo and the T pictures that a prior is trained to draw of it.
 
     Right hands (left ones mirrored), all pictures square; vertices are those of one hand model. `posed` and `viewmat`
-    of the photo may be off by an estimator's error; `rest` and the targets are true, so that what is learned lands
-    where it belongs.
+    of the photo may have an estimator's error. `rest` and the targets are true, so that the prior learns colours in
+    their true places.
     """
 
     image: Float[Tensor, "B S S 3"]
-    """Of the photo: a crop around the hand, its background included."""
+    """Crop of the photo around the hand, its background included."""
     mask: Float[Tensor, "B S S"]
     """Share of each of its pixels that is hand."""
     posed: Float[Tensor, "B V 3"]
     """The surface in the photo's pose [m]."""
     viewmat: Float[Tensor, "B 4 4"]
-    """Of the photo, world to camera."""
+    """World to camera of the photo."""
     K: Float[Tensor, "B 3 3"]
-    """Of the photo [px]."""
+    """Intrinsics of the photo [px]."""
     rest: Float[Tensor, "B V 3"]
     """The surface at rest [m]."""
     target_images: Float[Tensor, "B T H H 3"]

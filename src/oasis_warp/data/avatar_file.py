@@ -36,9 +36,9 @@ UNITS = {"length": "m", "angle": "rad", "quaternion": "wxyz", "color": "sRGB in 
 MAX_GAUSSIANS = 4_000_000
 """Forty times what the largest photos give; with all their tensors they fill .5 GB."""
 MAX_SIDE = 4096
-"""Of the source camera's picture, as of the largest painted one [px]: `edit` draws it."""
+"""Largest side of the source camera's picture, which `edit` draws, and of a painted picture [px]."""
 MAX_NUMBER = 1e9
-"""Of indices, whose true bounds are the hand model's."""
+"""Bound of indices; their true bounds are the hand model's."""
 
 
 class Entry(NamedTuple):

@@ -16,9 +16,9 @@ from oasis_warp.data.photo import read_bytes
 LARGEST = 256
 """Rows to which a map is scaled down: nine harmonics need no more."""
 GAMMA = 2.2
-"""Of pictures with 8 or 16 bits."""
+"""Gamma of pictures with 8 or 16 bits."""
 MAX_PIXELS = 1 << 26
-"""Of a map: 11,000 x 5,500, decoded .8 GB."""
+"""Most pixels of a map: 11,000 x 5,500, decoded .8 GB."""
 _RADIANCE = re.compile(rb"\A#\?.{0,4000}?\n\n-Y (\d{1,6}) \+X (\d{1,6})\n", re.DOTALL)
 
 

@@ -23,9 +23,9 @@ _FILL = re.compile(rb"\xff+")
 _WITHOUT_LENGTH = (0x01, *range(0xD0, 0xDA))
 """Markers of a JPEG that stand alone."""
 MAX_CHUNKS = 200_000
-"""Of a PNG: three times what the largest has, whose pixels come in chunks of 8 KB."""
+"""Most chunks of a PNG: three times what the largest has when its pixels come in chunks of 8 KB."""
 MAX_SEGMENTS = 10_000
-"""Of a file's header: more than any camera writes, few enough to be read at once."""
+"""Most segments of a file's header: more than any camera writes, few enough to be read at once."""
 _AVIF_BRANDS = (b"avif", b"avis")
 _HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
 
@@ -177,7 +177,7 @@ def _png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
 
 
 def pixels_of_png(data: bytes) -> bytes:
-    """A PNG without texts, colour profiles and further frames, of which 8 KB can take a decoder seconds."""
+    """A PNG without texts, colour profiles and further frames; 8 KB of these can take a decoder seconds."""
     parts = [data[at : at + n + 12] for kind, at, n in _png_chunks(data) if kind in _PNG_CHUNKS]
     return _PNG_MAGIC + b"".join(parts)
 

@@ -45,7 +45,7 @@ def _refuse(name: str) -> float:
 
 
 MAX_SIDE = 8192
-"""Of a picture [px]."""
+"""Largest side of a picture [px]."""
 
 
 def read_cameras(path: Path | str) -> list[Camera]:

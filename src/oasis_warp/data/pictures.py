@@ -28,12 +28,13 @@ VIDEO_SUFFIXES = (".mp4", ".gif", ".webp")
 TRANSPARENT = (".webp", "")
 """Endings of videos that can be transparent; a name without ending is a folder of PNG pictures."""
 _CODECS = ("vp09", "mp4v")
-"""Of OpenCV, in order of preference; its wheel has no H.264. Browsers do not play the second, MPEG-4 part 2."""
+"""Codecs of OpenCV, in order of preference; its wheel has no H.264. Browsers do not play the second, MPEG-4 part 2."""
 _GIF_PALETTE = (cv2.IMWRITE_GIF_DITHER, 3)
 """Choose 256 colours by octree: 41 dB on a photo. OpenCV's default, a fixed palette, has 17 dB."""
 _WEBP_QUALITY = (cv2.IMWRITE_WEBP_QUALITY, 90)
 _H264 = "-c:v libx264 -preset veryfast -crf 16 -pix_fmt yuv420p -threads 1 -movflags +faststart -fflags +bitexact"
-"""Of ffmpeg: 4:2:0, which every player knows; one thread, so that the file does not depend on their number."""
+"""Arguments of ffmpeg: 4:2:0, which every player knows; one thread, so that the file does not depend on their
+number."""
 
 
 def to_uint8(image: Float[Tensor, "H W C"]) -> UInt8[Tensor, "H W C"]:

@@ -23,9 +23,9 @@ MAX_BYTES, MAX_SPLATS = 1 << 30, 4_000_000
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 f_dc (Kerbl et al. 2023)."""
 SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
-"""Of .splat (github.com/antimatter15/splat)."""
+"""Row of a .splat file (github.com/antimatter15/splat)."""
 SPZ_MAGIC, SPZ_COLOR_SCALE = 0x5053474E, 0.15
-"""Of .spz (github.com/nianticlabs/spz); a byte of colour holds 0.5 + SPZ_COLOR_SCALE f_dc."""
+"""Constants of .spz (github.com/nianticlabs/spz); a byte of colour holds 0.5 + SPZ_COLOR_SCALE f_dc."""
 SPZ4_HEADER = 32
 """Length of a version 4's header [bytes]."""
 PLY_KINDS = {

@@ -18,7 +18,7 @@ def open_tensors(path: Path, content: str, source: str, remedy: str = "copy it a
     """Yield the open file.
 
     Args:
-        path: Of the file.
+        path: Path of the file.
         content: What it holds, for messages.
         source: Where to get such a file, for messages.
         remedy: What to do about a damaged one.

@@ -19,25 +19,25 @@ DatasetName = Literal["interhand", "hanco", "freihand", "ho3d", "coco-hand", "wh
 Split = Literal["train", "val", "test"]
 MAX_CAPTURES = 1000
 PAPER_CAPTURES = frozenset({0, 1, 2, 3, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 20, 22, 23, 24, 25})
-"""Of InterHand2.6M's training set, those that the paper trains on (appendix C)."""
+"""Captures of InterHand2.6M's training set that the paper trains on (appendix C)."""
 EXCLUDED_SEQUENCES = frozenset({
     "0000_neutral_relaxed", "0009_thumbtucknormal", "0019_alligator_closed", "0029_indextip",
     "0039_fingerspreadrigid", "0048_index_point", "0058_middlefinger",
 })  # fmt: skip
-"""Which it leaves out of them."""
+"""Sequences that the paper leaves out of them."""
 
 
 class Selection(NamedTuple):
     """What is taken of InterHand2.6M; the paper's choice, as far as it tells."""
 
     captures: frozenset[int] = PAPER_CAPTURES
-    """Of the training set."""
+    """Captures of the training set."""
     excluded: frozenset[str] = EXCLUDED_SEQUENCES
     """Sequences of these captures that are not taken."""
     test_captures: frozenset[int] = frozenset({0})
-    """Of the test set."""
+    """Captures of the test set."""
     test_sequences: frozenset[str] = frozenset({"ROM03_RT_No_Occlusion"})
-    """Of these captures."""
+    """Sequences of these captures."""
     test_step: int = 1
     """Every so many of their frames is taken. The paper has "fixed skip steps" and does not say which."""
 
@@ -72,7 +72,7 @@ def read_selection(path: Path) -> Selection:
 
 
 HANCO_SEQUENCE, HANCO_CAMERAS = 154, (0, 3, 5, 6, 7)
-"""Of HanCo, what it evaluates on."""
+"""Sequence and cameras of HanCo that the paper evaluates on."""
 PICTURES = (".jpg", ".jpeg", ".png", ".webp")
 _FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _ANCHOR = 4
@@ -85,10 +85,10 @@ def read_dataset(
     """The samples of a data set below `root`, as the paper takes them.
 
     Args:
-        name: Of the data set.
+        name: Name of the data set.
         root: Its folder. What lies in *.tar files directly in it counts as unpacked there.
         mano_dir: With MANO's files.
-        split: Of the data set.
+        split: Split of the data set.
         selection: What is taken of InterHand2.6M.
 
     Raises:

@@ -27,9 +27,9 @@ from oasis_warp.data.square_crop import resample_square
 from oasis_warp.hand.mano import ManoModel, ManoPose, mano_surface, mirror_mano_pose
 
 MAX_BYTES = 1 << 28
-"""Of a file in a tar file; annotations of a whole data set are larger, and lie beside it."""
+"""Largest file in a tar file; annotations of a whole data set are larger, and lie beside it."""
 _BLOCK = 512
-"""Of a tar file [bytes]."""
+"""Size of a block of a tar file [bytes]."""
 _UNSAFE = re.compile(r"(^|/)\.\.(/|$)|^/|\\|\0|^[A-Za-z]:")
 """Names that leave the folder they are relative to, here or on another system."""
 MARGIN = 1.3
@@ -44,9 +44,9 @@ class File(NamedTuple):
 
     path: Path
     start: int = 0
-    """Of the part [bytes]."""
+    """Start of the part [bytes]."""
     size: int | None = None
-    """Of the part [bytes]; None for the whole file."""
+    """Length of the part [bytes]; None for the whole file."""
 
     @property
     def exists(self) -> bool:
@@ -174,7 +174,7 @@ class Sample(NamedTuple):
     K: np.ndarray
     """[px], [3, 3]."""
     mano: ManoPose
-    """Of the model of its side, in the world; the mean pose included."""
+    """Pose of the model of its side, in the world; the mean pose included."""
     box: np.ndarray | None
     """Left, top, width, height of the annotated box [px]; None where the surface's own is taken."""
 
@@ -250,7 +250,7 @@ def pose_of_48(
     """MANO's parameters from 48 angles, 10 shapes and a translation [m].
 
     Args:
-        model: Of the side.
+        model: Model of the side.
         pose: Wrist and 15 joints, axis times angle [rad].
         betas: Shapes.
         transl: Translation.

@@ -207,8 +207,8 @@ class DatasetHands:
 
     def _silhouettes(self, hand: HandModel, pose: tuple[Tensor, ...], K: Tensor, size: int) -> Tensor:
         posed = pose_hands(hand, *pose).posed
-        still = torch.eye(4, device=self.device).expand(len(posed), -1, -1)
-        seen = depth_map(posed, hand.faces, still, K, size, size, outputs=["face_ids"], validate=False)
+        eye = torch.eye(4, device=self.device).expand(len(posed), -1, -1)
+        seen = depth_map(posed, hand.faces, eye, K, size, size, outputs=["face_ids"], validate=False)
         return (seen.face_ids >= 0).float()
 
 

@@ -44,7 +44,7 @@ from oasis_warp.hand.kinematics import HandKinematics
 _NO_HAND = 16
 """Smaller hands are refused even by force [px]."""
 _ROUNDS = 2
-"""Of pairing outlines."""
+"""Rounds of pairing outlines."""
 _CLEARLY = 0.5
 """Least sine of the angle at the wrist between index and little finger for palm or back to be plain. Of 60 photos
 of flat hands, gestures and fists the plain ones have .53 to .80; hands seen edge-on have .07 to .43."""
@@ -232,10 +232,10 @@ def shared_shape(shapes: Sequence[Float[Tensor, "S"]]) -> Float[Tensor, "S"]:
 
 
 def check_sides(photos: Sequence[Photo], landmarks: Sequence[Landmarks | HandFit]) -> None:
-    """All hands must be of one side: mirrored, the other hand would be another one.
+    """Check that all hands are of one side; a hand of the other side, mirrored, would be another hand.
 
     Raises:
-        InputError: some are not; it names those that the fewer, or less sure, say so.
+        InputError: some are not; it names the photos of the side that is shown less often or less clearly.
     """
     for_right = sum(
         (1 if found.side == "right" else -1) * (found.side_score if isinstance(found, Landmarks) else 1.0)

@@ -34,13 +34,13 @@ class FitSettings:
     landmark_scale: float = 3.0
     """Robust scale in sigmas (Charbonnier)."""
     bone: float = 0.45
-    """Of unit bone directions."""
+    """Sigma of unit bone directions."""
     limit: float = 0.05
     """Beyond a pose limit [rad]."""
     coupling: float = 0.35
-    """Of the flexion of an end joint about 2/3 of the middle joint's [rad]."""
+    """Sigma of the flexion of an end joint about 2/3 of the middle joint's [rad]."""
     angle: tuple[tuple[float, float], ...] = ((1.0, 0.5), (0.25, 0.35), (0.10, 0.25))
-    """Of flexion, abduction and twist about the relaxed pose, each for fingers and thumb [rad]."""
+    """Sigmas of flexion, abduction and twist about the relaxed pose, each for fingers and thumb [rad]."""
     relaxed: tuple[float, float, float] = (0.25, 0.45, 0.25)
     """Flexion of a relaxed finger's three joints [rad]."""
     shape: float = 1.0
@@ -54,9 +54,9 @@ class FitSettings:
     surface: float = 0.008
     """Least sigma of a pixel's place on the surface; the spread that the network gives is added in quadrature."""
     surface_spread: float = 4.0
-    """That spread counts so many times: neighbouring pixels err alike, and more on real photos than on those that the
-    network learned from. With 1, 2.5, 4 and 6 the IoU of the model with the masks of 15 photos is .953, .957, .959 and
-    .960; on 39 synthetic photos 1, 1.5 and 4 leave the surface 1.53, 1.51 and 1.59 % of the hand's box away."""
+    """Factor on that spread: neighbouring pixels err alike, and more on real photos than on those that the network
+    learned from. With 1, 2.5, 4 and 6 the IoU of the model with the masks of 15 photos is .953, .957, .959 and .960; on
+    39 synthetic photos 1, 1.5 and 4 leave the surface 1.53, 1.51 and 1.59 % of the hand's box away."""
     surface_scale: float = 2.0
     """Robust scale in sigmas (Cauchy)."""
     surface_weight: float = 200.0
@@ -64,7 +64,7 @@ class FitSettings:
     normal: float = 0.3
     normal_weight: float = 100.0
     weak_landmark: float = 0.04
-    """Of landmarks beside pixels."""
+    """Sigma of landmarks where pixels are read, too."""
 
 
 _FIXED = 1e-4

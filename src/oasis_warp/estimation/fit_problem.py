@@ -22,7 +22,7 @@ _LARGEST = 800.0
 
 
 def array(tensor: Tensor) -> np.ndarray:
-    """A tensor as float64 numpy, in which the fit computes."""
+    """A tensor as a float64 array: the fit computes in float64."""
     return tensor.detach().cpu().numpy().astype(np.float64)
 
 
@@ -219,7 +219,7 @@ def mirrored_state(
 
 
 def mirrored_fit(kinematics: HandKinematics, fit: HandFit) -> MirroredFit:
-    """A fit in the photo, which is mirrored for a left hand."""
+    """A fit as one of a right hand: the photo is mirrored for a left hand."""
     state = mirrored_state(kinematics, fit.side, array(fit.shape), fit.pose, fit.camera)
     xy, mask = fit.landmarks.xy.double(), fit.mask.detach().cpu()
     if fit.side == "left":

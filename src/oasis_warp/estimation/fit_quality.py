@@ -38,7 +38,7 @@ STRAY_SHARE = 0.35
 _STRAY_WARNED, _STRAY_FINGER = 0.2, 0.65
 """Shares of all pixels, and of those of a finger, about which a warning is given."""
 _MIN_PIXELS = 12
-"""Of a finger that is judged."""
+"""Least pixels of a finger that is judged."""
 _FINGERS_OF_JOINTS = ("index", "middle", "little", "ring", "thumb")
 """In the order of the model's joints."""
 _BORDER = 0.08
@@ -68,7 +68,7 @@ class FitQuality:
     worst_point: float
     """Largest of these distances [%]."""
     mask_iou: float
-    """Of mesh and mask, above the wrist line."""
+    """Intersection over union of mesh and mask, above the wrist line."""
     cost: float
 
     def beyond(self, bounds: Bounds) -> list[str]:
@@ -138,7 +138,7 @@ def keeps_quality(moved: HandFit, fit: HandFit) -> bool:
 
 
 def second_detections(rgb: np.ndarray, nets: Networks, xy: np.ndarray) -> list[DetectedHand]:
-    """Detections in a rotated crop, and in a mirrored one rotated the other way; those without a hand are left out.
+    """Detections in a rotated crop and in a mirrored one rotated the other way, without those that find no hand.
 
     Reliable landmarks move little.
     """

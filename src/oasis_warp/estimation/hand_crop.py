@@ -51,7 +51,7 @@ def native_size(fit: HandFit) -> int:
 
 
 def is_low_resolution(config: ReconstructConfig, *fits: HandFit) -> bool:
-    """Whether all photos are so small that fewer Gaussians do; not when `config` sets a size."""
+    """Whether all photos are so small that fewer Gaussians suffice; not when `config` sets a size."""
     return config.size == "auto" and max(map(crop_side, fits)) <= SMALL_SIZE
 
 
@@ -61,9 +61,9 @@ def detail_size(fit: HandFit, config: ReconstructConfig) -> int:
 
 
 def finer_size(fit: HandFit, config: ReconstructConfig) -> int | None:
-    """Side of the crop whose detail goes into finer Gaussians [px]; None where the coarse ones do.
+    """Side of the crop whose detail goes into finer Gaussians [px]; None where the coarse ones suffice.
 
-    In even light there is none: what the photo shows beyond the prior is not taken over as it is.
+    In even light there is none: what the photo shows beyond the prior is not taken over.
     """
     size = detail_size(fit, config)
     return size if config.light != "even" and size > COARSE_SIZE else None
@@ -87,7 +87,7 @@ def refine_surfaces(
     hand: HandModel, photos: Sequence[Photo], fits: Sequence[HandFit], surfaces: Surfaces,
     guesses: Sequence[CanonicalGaussians], config: ReconstructConfig,
 ) -> Surfaces:  # fmt: skip
-    """Surfaces moved until the prior's guesses are drawn with the outlines of their photos."""
+    """Move the surfaces until the prior's guesses, drawn on them, have the outlines of their photos."""
 
     def refined(offsets: Tensor, *indices: int) -> Tensor:
         crops = [crop_hand(photos[k], fits[k], offsets, config, detail_size(fits[k], config)) for k in indices]
@@ -104,7 +104,7 @@ def crop_hand(
 
     Args:
         photo: The photo.
-        fit: Of its hand.
+        fit: Fit of its hand.
         offsets: From the fitted rest surface to the one that carries Gaussians [m].
         config: Size, device and the hand model of `fit`.
         size: Side of the crop [px]; if not given, what `config` wants, up to `COARSE_SIZE`.
@@ -149,7 +149,7 @@ def crop_hand(
 def _resampled_reading(
     reading: SurfaceReading, left: float, top: float, side: float, size: int
 ) -> Float[Tensor, "S S 4"]:
-    """`HandCrop.reading`: that of the nearest sample, because the mean of two fingers' places is no place."""
+    """`HandCrop.reading`, by the nearest sample: the mean of the places on two fingers is no place."""
     planes = torch.cat([reading.places, reading.spread[..., None]], -1)
     steps = (torch.arange(size, dtype=torch.float64) + 0.5) / size * side
     starts = top - reading.top, left - reading.left

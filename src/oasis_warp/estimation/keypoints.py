@@ -35,7 +35,7 @@ _POSE_KEYS = {"side", "angles", "orientation", "translation", "shape", "focal", 
 FAR_OUT = 1.0
 """Farthest landmark beyond the border of the photo, over its longer side: a hand may be cut, not far away."""
 MIN_PIXELS = 8
-"""Least extent of a hand, of which nothing can be seen below [px of the photo as read]."""
+"""Least extent of a hand [px of the photo as read]; nothing can be seen of a smaller one."""
 MIN_WORLD = 0.01
 """Least extent of the points of `world` [m]: a fist has a few times as much."""
 FOCALS = (0.05, 1000.0)
@@ -45,7 +45,7 @@ DEPTHS = (0.02, 100.0)
 REACH, MAX_SHAPE, MAX_ANGLE = 1.0, 10.0, 2 * math.pi
 """Bounds of `world` [m], `shape` [standard deviations] and `angles` [rad]."""
 MAX_NUMBER = 1e9
-"""Of all others, so that float32 holds their squares."""
+"""Bound of all other numbers: float32 holds their squares."""
 
 
 def read_keypoints(
@@ -171,10 +171,10 @@ def fit_of_pose(
     Args:
         hand: The model that `shape` and `pose` belong to.
         photo: The photo.
-        side: Of the hand; a left hand's pose describes the mirrored model.
+        side: Side of the hand; a left hand's pose describes the mirrored model.
         shape: Coefficients, [S].
         pose: In the camera's frame.
-        camera: Of the photo, with an identity viewmat.
+        camera: Camera of the photo, with an identity viewmat.
     """
     kinematics = HandKinematics(hand)
     state = _state(kinematics, side, shape, pose, camera)

@@ -20,7 +20,7 @@ FINGERS = {"thumb": [1, 2, 3, 4], "index": [5, 6, 7, 8], "middle": [9, 10, 11, 1
 
 _MIN_PRESENCE = 0.5
 _MIN_GUESS = 0.8
-"""Least presence and side score in fallback searches, in which the palm detector finds false hands."""
+"""Least presence and side score in fallback searches; the palm detector finds false hands there."""
 _MARGIN = 0.35
 """Border replicated around the photo in fallback searches, as a fraction of its longer side."""
 

@@ -54,7 +54,7 @@ class Estimate(NamedTuple):
     place: np.ndarray
     """What is added to the hand in the camera's frame [m], [3]."""
     focal: float
-    """Of the file's photo [px]."""
+    """Focal length of the file's photo [px]."""
     centre: np.ndarray
     """[px], [2]."""
 
@@ -68,7 +68,7 @@ def full_camera(
 
     Args:
         weak: Scale and shift of the network; of a left hand with x mirrored back.
-        box_center: Of the crop [px], [2].
+        box_center: Centre of the crop [px], [2].
         box_size: Side of the crop [px].
         size: Width and height of the photo.
         focal: [px].
@@ -86,7 +86,7 @@ def read_estimate(
     Args:
         path: The file.
         photo: What it was estimated from.
-        which: Of several hands.
+        which: The hand to take where there are several.
         content: Its bytes, where they lie elsewhere; `path` is for messages then.
 
     Raises:
@@ -109,7 +109,7 @@ def read_estimate(
 
 
 def estimate_of_entries(path: Path, entries: Mapping[str, Any], photo: Photo) -> Estimate:
-    """The hand of a table of `read_estimate`'s names that comes from elsewhere, as from JSON."""
+    """The hand of a table with `read_estimate`'s names that comes from elsewhere, such as JSON."""
     return _estimates(path, _flat(entries), photo)[0]
 
 

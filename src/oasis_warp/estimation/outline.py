@@ -39,7 +39,7 @@ class WristLine(NamedTuple):
         return (points - self.wrist) @ self.up / self.length
 
     def above(self, points: np.ndarray) -> np.ndarray:
-        """Which points lie on the hand's side of the line."""
+        """Whether each point lies on the hand's side of the line."""
         return (points - self.wrist) @ self.up > WRIST_LINE * self.length
 
     def above_mask(self, size: tuple[int, int], share: float = WRIST_LINE) -> np.ndarray:
@@ -104,7 +104,7 @@ def front_faces(image: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def is_grazing(seen: np.ndarray, normals: np.ndarray, limit: float) -> np.ndarray:
-    """Which points in the camera's frame are seen at a grazing angle, |normal . view| < `limit`."""
+    """Whether each point in the camera's frame is seen at a grazing angle, |normal . view| < `limit`."""
     return np.abs((normals * unit(seen)).sum(1)) < limit
 
 

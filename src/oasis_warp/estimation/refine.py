@@ -95,7 +95,7 @@ class PhotoError(NamedTuple):
     gap: float
     """Robust mean of the squared residuals of the photo, in sigmas of the start."""
     mask_iou: float
-    """Of surface and mask, above the wrist."""
+    """Intersection over union of surface and mask, above the wrist."""
     pixels: int
     """Number of pixels that were compared."""
 
@@ -253,7 +253,7 @@ class _Problem:
         return self._image_cost(photo[0], outline[0], share) + self.fit_weight * of_fit + from_start
 
     def linearize(self, state: FitState, blurs: tuple[float, float]) -> tuple[QuadraticModel, Tensor]:
-        """The cost near `state`, and the light that suits `state` best, in which it holds."""
+        """The cost near `state` in the light that suits `state` best, and that light."""
         rendered = self.rendered([state, *(self.moved(state, step) for step in np.diag(self.steps))])
         light = solve_light(self.scene, rendered, 0)
         photo, outline, share = self._gaps(rendered, light, blurs)

@@ -40,7 +40,7 @@ def mask_from_reading(rgb: np.ndarray, reading: PixelReading, xy: np.ndarray) ->
 
     Args:
         rgb: The photo, [H, W, 3] bytes.
-        reading: Of this photo.
+        reading: Reading of this photo.
         xy: Landmarks [px].
     """
     size, margin = (rgb.shape[1], rgb.shape[0]), 0.15 * box_size(xy)

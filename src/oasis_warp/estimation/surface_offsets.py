@@ -66,9 +66,9 @@ _CLOSE = 12.0
 def outline_offsets(hand: HandModel, *fits: HandFit) -> Float[Tensor, "V 3"]:
     """Displacement of the rest surface that brings the outlines of the posed mesh onto the masks' [m].
 
-    Add it to the vertices at rest (`skinning.rest_hand`) before skinning; for a left hand, before mirroring, as the
-    pose is. It is zero where no outline is seen: at the wrist, at a photo's border, across gaps wider than 4 % of the
-    hand, and towards the far side of the hand.
+    Add it to the vertices at rest (`skinning.rest_hand`) before skinning. For a left hand, add it before mirroring, as
+    with the pose. It is zero where no outline is seen: at the wrist, at a photo's border, across gaps wider than 4 % of
+    the hand, and towards the far side of the hand.
 
     Args:
         hand: The model.
@@ -299,8 +299,8 @@ def _operator(function: Callable[[np.ndarray], np.ndarray], shape: tuple[int, in
 def _bending(faces: bytes, n: int) -> tuple[sparse.csc_array, np.ndarray]:
     """BEND L^T L + STAY with the umbrella operator L (mean of the neighbours minus the vertex), and its order.
 
-    The order of the vertices, in which the matrix is given, makes factors sparse (minimum degree). Targets add to the
-    diagonal alone, so that it serves every photo.
+    The matrix is given in an order of the vertices that makes factors sparse (minimum degree). Targets add to the
+    diagonal alone, so that one order serves every photo.
     """
     a, b, c = np.frombuffer(faces, np.int64).reshape(-1, 3).T
     i, j = np.r_[a, b, c, b, c, a], np.r_[b, c, a, a, b, c]

@@ -12,7 +12,7 @@ from oasis_warp.hand.kinematics import HandKinematics, rotation_between
 _STRIDE = 16
 """Every so many vertices are compared."""
 _SIGMA, _SCALE = 1e-3, 3.0
-"""Of the distance of a vertex from the model [m], and its robust scale in sigmas (Charbonnier)."""
+"""Sigma of the distance of a vertex from the model [m], and its robust scale in sigmas (Charbonnier)."""
 _ANGLE = 2.0
 """Sigma of the angles about rest, which holds those that no vertex determines [rad]."""
 _SILENT = 2e-3
@@ -55,7 +55,7 @@ def state_of_surface(
         shape: Coefficients, [S], as `shape_of` finds them.
         rest: Surface at rest [m], [V, 3].
         posed: The same surface in the camera's frame [m], [V, 3].
-        focal: Of the camera [px].
+        focal: Focal length of the camera [px].
         centre: Its principal point [px], [2].
     """
     own, n_angles = rest - kinematics.rest_surface(shape), len(kinematics.dofs)

@@ -33,7 +33,7 @@ MIN_PIXELS = 800
 """Fewest pixels whose contrasts are measured: some 4 % of a hand that fills its picture."""
 
 Contrasts = tuple[float, ...]
-"""Of each of `BANDS`: root mean square of the logarithm of the luminance over the pixels that count, in percent."""
+"""Root mean square of the logarithm of the luminance in each of `BANDS`, over the pixels that count, in percent."""
 
 
 def log_brightness(image: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:

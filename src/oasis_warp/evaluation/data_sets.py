@@ -54,11 +54,11 @@ ERROR_STREAM = 7
 
 
 class Key(NamedTuple):
-    """Which picture of a data set."""
+    """The name of a picture in a data set."""
 
     subject: str
     name: str
-    """Of the picture; no other has it."""
+    """Name of the picture; no other has it."""
 
     @property
     def file(self) -> str:
@@ -113,14 +113,14 @@ class Row(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Choice:
-    """Which pictures are looked at."""
+    """Choice of the pictures that are evaluated."""
 
     photos: int = 16
-    """Of each person, that avatars are made of."""
+    """Photos of each person that avatars are made of."""
     targets: int = 4
-    """That each avatar is compared with; the photo itself where a person has no other."""
+    """Pictures that each avatar is compared with; the photo itself where a person has no other."""
     seed: int = 0
-    """Of wrong poses."""
+    """Seed of wrong poses."""
 
 
 def evenly(items: Sequence[Any], count: int) -> list[Any]:
@@ -211,7 +211,7 @@ class Crop(NamedTuple):
 
     fit: HandFit
     offsets: Tensor
-    """Of the rest surface [V, 3]."""
+    """Offsets of the rest surface [V, 3]."""
     hand: HandCrop
 
 
@@ -331,7 +331,7 @@ def _measured(image: Tensor, truth: TargetTruth, perceptual: Perceptual | None) 
 
 @torch.no_grad()
 def frames_per_second(avatar: Avatar) -> float:
-    """Of posing and drawing, in the photo's camera."""
+    """Frames a second of posing and drawing, in the photo's camera."""
     device, frames = avatar.device.type, 0
     for _ in range(WARM):
         avatar.render(avatar.source_camera, avatar.source_pose)

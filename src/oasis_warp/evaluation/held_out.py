@@ -63,7 +63,7 @@ class CaptureConfig:
     size: int = 256
     """Side of photos and targets [px], a multiple of 16."""
     seed: int = HELD_OUT_SEED
-    """Of people, pictures and the estimator's errors."""
+    """Seed of people, pictures and the estimator's errors."""
 
 
 class CapturedPerson(NamedTuple):

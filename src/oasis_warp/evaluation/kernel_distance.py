@@ -21,18 +21,18 @@ from oasis_warp.network.dense_network import DenseNetwork
 LAYERS = ("half", "quarter", "eighth", "sixteenth")
 """The encoder of the dense network at these shares of the picture's side; the last after its self-attention."""
 DEGREE = 3
-"""Of the kernel (x . y / d + 1)^3."""
+"""Degree of the kernel (x . y / d + 1)^3."""
 SUBSETS = 100
 """Halves of the groups that the standard error is taken from."""
 MIN_GROUPS = 4
-"""Fewest groups on either side of which a distance is measured."""
+"""Fewest groups on either side of a distance."""
 SPREAD_FLOOR = 1e-3
 """Least standard deviation of a channel, over the largest, that it is divided by."""
 MAX_SPREADS = 3.0
 """Standard deviations to which channels are clipped: cubed, one odd picture would outweigh all others."""
 
 Features = dict[str, list[float]]
-"""Of one picture, by `LAYERS`."""
+"""Features of one picture, by `LAYERS`."""
 
 
 class Sample(NamedTuple):
@@ -84,10 +84,10 @@ def kernel_distances(
     Args:
         drawn: One crowd.
         real: The other.
-        scale: Whose mean and standard deviation the channels are centred on and divided by: all real hands, so that
+        scale: Features that centre and scale the channels by mean and standard deviation: all real hands, so that
             distances can be compared.
-        seed: Of the subsets.
-        subsets: Of `kernel_distance`.
+        seed: Seed of the subsets.
+        subsets: Subsets of `kernel_distance`.
 
     Raises:
         ValueError: a crowd has fewer than `MIN_GROUPS` groups.
@@ -123,7 +123,7 @@ def kernel_distance(
 
 
 def _half(groups: np.ndarray, n_groups: int, random: np.random.Generator) -> np.ndarray:
-    """Which of all groups are in a random half of those of a crowd, bool [G]."""
+    """Whether each group is in a random half of the groups of a crowd, bool [G]."""
     own = np.unique(groups)
     return np.isin(np.arange(n_groups), random.permutation(own)[: max(2, len(own) // 2)])
 

@@ -64,7 +64,7 @@ class Looks(NamedTuple):
     samples: dict[str, list[Sample]]
     """Features of its pictures by kind of view: "input", "side" (but that of the photo) and "pose"."""
     cells: list[Cell]
-    """Of the contact sheet."""
+    """Cells of the contact sheet."""
 
 
 @torch.no_grad()
@@ -79,7 +79,7 @@ def measure_looks(
     Args:
         photo: What `made` was made of.
         made: By `reconstruct`.
-        group: Of the hand, for the kernel distance.
+        group: Group of the hand, for the kernel distance.
         perceptual: LPIPS.
     """
     avatar, left = made.avatar, made.avatar.side == "left"

@@ -46,7 +46,7 @@ WOUND = 0.4
 """Brightness of the darkest percent of an opened palm, over its median, below which that is a wound: the least of seven
 real palms, open or nearly so, is .41."""
 DIGITS = 4
-"""Of numbers over all photos: of medians those that count, of distances those behind the point."""
+"""Digits of numbers over all photos: significant digits of medians, decimals of distances."""
 
 
 def evaluate_looks(
@@ -64,8 +64,8 @@ def evaluate_looks(
     with what is missing. Photos that show no hand, or that no pose fits, are left out and named in METRICS.
 
     Args:
-        prior: Of the avatars.
-        folder: Of photos, each of another hand; a subfolder holds photos of one hand.
+        prior: Prior of the avatars.
+        folder: Folder of photos, each of another hand; a subfolder holds photos of one hand.
         out: Output folder.
         config: Its steps, seed and device are used; all else is as `reconstruct` ships it.
         perceptual: LPIPS, where its weights are at hand.

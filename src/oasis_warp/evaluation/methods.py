@@ -98,10 +98,10 @@ def reconstructions(
 
     Args:
         hand: On the CPU, as in `reconstruction.reconstruct`.
-        crop: Of one photo.
+        crop: Crop of one photo.
         priors: By the names that methods have for them.
         methods: Methods to run.
-        config: Of the adaptation; stages other than `ONE_SHOT` replace its light.
+        config: Options of the adaptation; stages other than `ONE_SHOT` replace its light.
         perceptual: LPIPS, where the paper's way of adaptation is asked for.
 
     Raises:

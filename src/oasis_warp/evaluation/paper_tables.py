@@ -100,7 +100,7 @@ class PaperTable(NamedTuple):
     """A table as text."""
 
     name: str
-    """Of its files."""
+    """Name of its files."""
     title: str
     headings: list[str]
     lines: list[list[str]]
@@ -124,8 +124,8 @@ def rows_of_tables(priors: dict[str, Prior], ablated: Sequence[Prior], steps: in
     Args:
         priors: With "learned", a network.
         ablated: Networks with one part switched off.
-        steps: Of texture learning in every row, instead of the paper's 400 and our own end.
-        seed: Of adaptation.
+        steps: Steps of texture learning in every row, instead of the paper's 400 and our own end.
+        seed: Seed of adaptation.
     """
     learned = priors["learned"]
     shipped = AdaptConfig(texture_steps=steps, seed=seed)

@@ -98,7 +98,7 @@ def mostly_shows(surface: Surface) -> Literal["palm", "back"]:
 
 
 def summarise_real(records: Sequence[Record]) -> Record:
-    """Of each of `SIDES`: the number of photos and hands, and quartiles of the contrasts of photos."""
+    """The number of photos and hands of each of `SIDES`, and quartiles of the contrasts of photos."""
     table: Record = {}
     for side in SIDES:
         own = [record for record in records if side in record["contrast"]]

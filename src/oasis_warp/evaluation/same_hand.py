@@ -96,7 +96,7 @@ def compare_pairs(
 
     Args:
         estimator: Fits the second photo, with the shape of the first one's avatars.
-        photos: Of one hand, and where it is in each.
+        photos: Photos of one hand, and where it is in each.
         avatars: By photo and then by a name, all of one photo with the same shape; photos without are targets only.
         config: Size of the pictures and device.
     """
@@ -137,7 +137,7 @@ def compare_with_photo(avatar: Avatar, drawn: Render, crop: HandCrop, pose: Hand
 
 
 def _small_ssim(image: Tensor, target: Tensor, weight: Tensor) -> float:
-    """Of the mean colours of blocks, over black beyond `weight`."""
+    """SSIM of the mean colours of blocks, over black beyond `weight`."""
     planes = torch.cat([image * weight[..., None], target * weight[..., None], weight[..., None]], -1)
     small = avg_pool2d(planes.permute(2, 0, 1), QUARTER).permute(1, 2, 0)
     share = small[..., 6]

@@ -148,7 +148,7 @@ SYNTHETIC = {
     "ssim_mask": Measure("in the mask", ".4f"),
     "lpips": Measure("LPIPS", ".4f"),
 }
-"""Of `summary.summarise`."""
+"""Columns of `summary.summarise`."""
 PHOTOS = {
     "psnr": Measure("PSNR, dB", ".2f"),
     "psnr_plain": Measure("without a gain", ".2f"),
@@ -160,13 +160,13 @@ PHOTOS = {
     "beaten_ssim_quarter": Measure("by SSIM", ".0%"),
     "beaten_error": Measure("by colours", ".0%"),
 }
-"""Of `same_hand.summarise_pairs`."""
+"""Columns of `same_hand.summarise_pairs`."""
 LOOKS = {
     "photos": Measure("photos", ".0f"),
     **{f"contrast {band}": Measure(f"{band} px: %", ".2f") for band in BANDS},
     **{f"ratio {band}": Measure(f"ratio {band}", ".2f") for band in BANDS},
 }
-"""Of the contrasts of `looks.summarise_looks`."""
+"""Columns of the contrasts of `looks.summarise_looks`."""
 REGIONS = {
     "seen": "seen, in the photo's view", "turned": "seen, in other poses", "hidden_palm": "palm that the photo hides",
     "hidden_back": "back that the photo hides",
@@ -182,7 +182,7 @@ BLEMISHES = {
     "back_brightness": Measure("back brighter or darker, times", ".2f"),
     "back_hue": Measure("its hue, times", ".2f"),
 }
-"""Of the blemishes of `looks.summarise_looks`."""
+"""Columns of the blemishes of `looks.summarise_looks`."""
 COLORS = {"same": "raw", "studio": "raw", "wild": "matched"}
 """How colours are compared in each light: a photo in another light does not show the colours of even light."""
 GROUPS = {"ordinary": "People as in training", "tattoo": "The same people with a tattoo", "ring": "And with a ring"}

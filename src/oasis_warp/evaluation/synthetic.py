@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp import __version__
-from oasis_warp.avatar.pose import pose_gaussians, turn_light, with_photo
+from oasis_warp.avatar.pose import pose_gaussians, rotate_light, with_photo
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
@@ -52,9 +52,9 @@ SETTINGS, METRICS, SHEET, ATTENTION, PEOPLE = (
 SHOWN = 4
 """People of each group on the sheet, and hands on the picture of attention."""
 DIGITS = 5
-"""Of the numbers in files."""
+"""Digits of the numbers in files."""
 KEYS = ("group", "person", "light", "noise", "prior", "stage", "target", "colors", "psnr")
-"""Of every record."""
+"""Keys of every record."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,7 +182,7 @@ def _measured(
 
 
 def _packed(setup: _Setup) -> bytes:
-    """Pickled as a whole: single tensors would pass through shared memory, of which containers have little."""
+    """Pickled as a whole: single tensors would pass through shared memory, and containers have little of it."""
     buffer = io.BytesIO()
     pickler = pickle.Pickler(buffer)
     pickler.dispatch_table = {**copyreg.dispatch_table, MappingProxyType: lambda proxy: (dict, (dict(proxy),))}
@@ -253,7 +253,7 @@ def draw_targets(
         if made.light is None or rotations is None:
             posed_gaussians = pose_gaussians(made.without_light(), hand.faces, rest, posed)
         else:
-            light = turn_light(made.light, rotations[k].to(rest))
+            light = rotate_light(made.light, rotations[k].to(rest))
             light = with_photo(light, rest, batch.posed[0], hand.faces)
             posed_gaussians = pose_gaussians(made.gaussians, hand.faces, rest, posed, light)
         images.append(render(posed_gaussians, Camera(viewmat, K, size, size)).image)

@@ -28,7 +28,7 @@ DRAWN_SIZE = FINE * SIZE
 GROUND = (0.93, 0.93, 0.92)
 """Colour behind the hand."""
 AZIMUTHS = tuple(range(0, 360, 45))
-"""Of the sides [degrees]: 0 is that of the photo."""
+"""Azimuths of the sides [degrees]: 0 is the side of the photo."""
 POSES = POSE_NAMES[1:]
 """All named ones but rest, which is nearly that of relaxed."""
 RIM = 4

@@ -77,7 +77,7 @@ def export_avatar(
     """Write `avatar` in the format that the ending of `path` says; docs/export.md lists them.
 
     Args:
-        avatar: Whose Gaussians or skin are written.
+        avatar: The avatar whose Gaussians or skin are written.
         path: File to write; an existing one is replaced when the new one is complete.
         pose: Pose of the hand. By default that of the photo, and in files that can be posed the rest pose.
         light: "baked" to write colours as they are in the avatar's light, "none" as in even light, for programs with

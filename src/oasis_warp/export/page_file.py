@@ -44,7 +44,7 @@ WALK = ("open", "fist", "victory", "point", "ok")
 BULK = (0.01, 0.99)
 """Quantiles of the means of foreign Gaussians, which the view frames: some float far away."""
 SPLATS_RADIUS = 0.1
-"""Of what the view frames then [m], a hand's."""
+"""Radius that the framed Gaussians are scaled to [m]: that of a hand."""
 WALK_FRAMES, WALK_SECONDS = 12, 7.5
 """Frames from one of them to the next, which the page blends, and length of the motion."""
 
@@ -77,7 +77,7 @@ def page_facts(
 
     Args:
         avatar: Any.
-        angles: That the page begins with; those of the photo when not given.
+        angles: Angles that the page begins with; those of the photo when not given.
         look: "photo" or "even" light to begin with; an avatar without light of its own begins in even light.
     """
     parts = avatar.parts
@@ -194,7 +194,7 @@ def _reached(avatar: Avatar, angles: Sequence[Tensor]) -> Float[Tensor, "B V 3"]
 
 
 def _middle(vertices: Float[Tensor, "N 3"]) -> Float[Tensor, "3"]:
-    """Of the box around them, at which `orbit_camera` looks."""
+    """Middle of the box around the vertices; `orbit_camera` looks there."""
     return (vertices.amin(0) + vertices.amax(0)) / 2
 
 
@@ -338,7 +338,7 @@ def page_html(
     Args:
         avatar: Any.
         title: Shown above the controls and by the browser.
-        pose: Whose angles the page begins with; those of the photo when not given.
+        pose: The pose that the page begins with; that of the photo when not given.
         look: "photo" or "even": light that it begins with.
         photo: Shown beside the hand.
     """

@@ -90,7 +90,7 @@ def write_gltf(path: Path, document: dict[str, Any], buffer: GltfBuffer) -> None
     """Write a .glb, or with that ending a .gltf, whose buffer is text inside it, atomically.
 
     Args:
-        path: Of the file.
+        path: Path of the file.
         document: The JSON without asset, buffers, views and accessors.
         buffer: What the document's accessors are of.
 

@@ -55,7 +55,7 @@ def write_ply(request: ExportRequest, path: Path) -> None:
 
 
 def ply_header(*elements: tuple[str, int, str, tuple[str, ...]]) -> bytes:
-    """Of a binary PLY, for elements of a name, a number of rows, a type and columns.
+    """Header of a binary PLY; each element is a name, a number of rows, a type and columns.
 
     Without comments: importers of some engines stumble over them.
     """
@@ -112,14 +112,14 @@ def _ply_quats(quats: np.ndarray) -> np.ndarray:
 
 
 ZSTD_LEVEL = 19
-"""Of zstd: the last that needs no more memory to read."""
+"""Level of zstd: the highest that needs no more memory to read."""
 FRACTION_BITS = 20
-"""Of means: steps of 0.95 um and a reach of 8 m. The reference encoder's 12 are steps of 0.24 mm, as far apart as the
-lines of skin."""
+"""Fraction bits of means: steps of 0.95 um and a reach of 8 m. The reference encoder's 12 are steps of 0.24 mm, as far
+apart as the lines of skin."""
 SCALE_STEPS, SCALE_ZERO = 16, -10
 """A byte holds SCALE_STEPS (log scale - SCALE_ZERO): steps of 6 %, from 45 um on."""
 QUAT_STEPS = 511
-"""Of the three smaller components, each of which has 9 bits and a sign."""
+"""Steps of the three smaller components; each has 9 bits and a sign."""
 
 
 def write_spz(request: ExportRequest, path: Path) -> None:
@@ -196,7 +196,7 @@ def write_splat(request: ExportRequest, path: Path) -> None:
 
 
 SOG_LEVELS = 256
-"""Of scales and colours, evenly spaced: steps of 1 to 2 % of a scale, and finer than a byte of a colour."""
+"""Levels of scales and colours, evenly spaced: steps of 1 to 2 % of a scale, and finer than a byte of a colour."""
 LARGEST_ALPHA = 252
 """Alpha of a quaternion whose largest component is the first of wxyz."""
 LOSSLESS = (cv2.IMWRITE_WEBP_QUALITY, 101)

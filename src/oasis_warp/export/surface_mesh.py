@@ -29,7 +29,7 @@ class Topology(NamedTuple):
     """Vertices of the mesh, as vertices of the hand: U with a texture coordinate each, R of the rim, one of the cap."""
 
     vertex: Int[Tensor, "U+R"]
-    """Of the hand; the last vertex of the mesh is the mean of those of the rim."""
+    """Vertex of the hand; the last vertex of the mesh is the mean of those of the rim."""
     rim: Int[Tensor, "R"]
     uv: Float[Tensor, "U+R+1 2"]
     """v points up in the picture."""
@@ -99,14 +99,14 @@ class SkinnedMesh(NamedTuple):
     """A mesh of W vertices in metres, the wrist at the origin, y up, fingers to -z; at rest."""
 
     hand: HandModel
-    """Of the avatar's side, in its own axes."""
+    """Hand of the avatar's side, in its own axes."""
     rest: PosedHand
     rig: Rig
     mesh: Topology
     points: Float[Tensor, "W 3"]
     normals: Float[Tensor, "W 3"]
     joints: Int[Tensor, "W I"]
-    """Of the rig."""
+    """Joints of the rig."""
     weights: Float[Tensor, "W I"]
     correctives: Float[Tensor, "C W 3"]
     """Displacements before skinning, at weight 1 [m]."""
@@ -115,7 +115,7 @@ class SkinnedMesh(NamedTuple):
     """Coefficients of `hand.skinning.corrective_coefficients` at weight 1."""
 
     def corrective_weights(self, angles: Float[Tensor, "*B 15 3"]) -> Float[Tensor, "*B C"]:
-        """Of the correctives at joint `angles` [rad]; 0 to 1 within the limits of a hand with two for each joint."""
+        """Weights of the correctives at joint `angles` [rad]; 0 to 1 within the limits of a hand with two a joint."""
         return corrective_coefficients(self.hand, angles.to(self.strengths)) / self.strengths
 
 

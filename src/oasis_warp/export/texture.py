@@ -66,7 +66,7 @@ def bake_colors(request: ExportRequest, light: str, size: int) -> tuple[Float[Te
     sees who looks at the skin from everywhere.
 
     Args:
-        request: Whose skin, and in what pose light falls on it.
+        request: The avatar whose skin it is, and the pose in which light falls on it.
         light: "baked" or "none".
         size: Side [px].
 
@@ -133,7 +133,7 @@ people, from their true albedo (docs/export.md says what it is worth)."""
 FINE, COARSE = 0.4e-3, 4e-3
 """Standard deviations between which detail counts as relief [m]: a pixel, and the breadth of a fold with its flanks."""
 MIN_LUMINANCE = 0.02
-"""Whose logarithm is taken of darker pixels: ink and dirt are no abysses."""
+"""Luminance that darker pixels count with in the logarithm, so that ink and dirt are not deep holes."""
 SKIN, PALM, PALM_TIP, NAIL = 0.56, 0.04, -0.06, 0.32
 """GGX roughness of skin, what the palm and its finger tips add, and that of nails: the means of the synthetic world, by
 which `synthetic.skin_texture` draws its gloss."""
@@ -147,7 +147,7 @@ def bake_material(request: ExportRequest, size: int) -> dict[str, bytes]:
     The roughness is green; blue, which glTF has for metal, is 0.
 
     Args:
-        request: Whose skin, and in what light; none if it does not say.
+        request: The avatar whose skin it is, and the light; none if it does not say.
         size: Side [px].
 
     Raises:
@@ -170,9 +170,9 @@ def material_maps(avatar: Avatar, colors: Float[Tensor, "S S 3"], texels: Texels
     finer than `FINE` or coarser than `COARSE`. What the photo's light shades is not in it.
 
     Args:
-        avatar: Whose skin.
+        avatar: The avatar whose skin it is.
         colors: Albedo, sRGB.
-        texels: Of the colours' size.
+        texels: Texels of the colours' size.
     """
     slopes = relief_slopes(avatar, colors, texels)
     flat = torch.tensor([0.0, 0.0, 1.0]).expand(len(slopes), 3).clone()

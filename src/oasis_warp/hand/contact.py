@@ -1,4 +1,4 @@
-"""Flesh that does not pass through flesh: fingers and palm of a posed hand give way to each other."""
+"""Contact of a posed hand with itself: fingers and palm that pass through each other are moved apart."""
 
 import functools
 import math
@@ -18,14 +18,14 @@ from oasis_warp.ops.contact import GROUP, PARTS_OPPOSED, ContactTables, contact_
 
 LIMIT = 0.004
 """Largest shift of a vertex [m]."""
-FLESH = 0.4
-"""The part of the distance from a finger's bone to its skin that gives way: bones take .42 of it."""
+YIELD = 0.4
+"""Share of the distance from a finger's bone to its skin that can yield: bones take .42 of it."""
 SPACING = 0.014
 """Width of patches of skin that are tested as one, and what a right angle between normals counts there [m]."""
 APART = 0.015
 """Distance over the surface from which two patches may touch [m]: nearer ones only bend."""
 RINGS = 2
-"""Of neighbours, over which a shift is spread: 4 mm."""
+"""Rings of neighbours over which a shift is spread: 4 mm."""
 NAIL_EDGE = 2
 """Rings around a nail over which skin becomes free of it."""
 FREE = math.radians(10)
@@ -34,21 +34,20 @@ SAMPLES = 8
 """Faces whose mean normal is that of a patch."""
 
 
-def giving_way(
+def resolve_contact(
     hand: HandModel,
     vertices: Float[Tensor, "*B V 3"],
     side: Side = "right",
     bent: Float[Tensor, "*B"] | None = None,
 ) -> Float[Tensor, "*B V 3"]:
-    """Posed vertices of a hand, led out of each other: both sides of a contact give way, at most by `LIMIT` each.
+    """Move posed vertices of a hand out of each other: both sides of a contact yield, each by at most `LIMIT`.
 
-    Fingers give way by up to `FLESH` of their thickness, nails not at all. Vertices that no contact reaches stay as
-    they are, to the bit, and on the CPU a hand without contact is returned itself. The shifts are constants to
-    derivatives. What lies deeper inside than both sides can give stays inside by the rest, and the skin of one bone is
-    never led out of itself.
+    Fingers yield by up to `YIELD` of their thickness, nails not at all. Vertices that no contact reaches keep their
+    bits; on the CPU a hand without contact is returned itself. Derivatives see the shifts as constants. Skin that lies
+    deeper inside than both sides can yield stays inside by the rest. The skin of one bone is never moved out of itself.
 
     Args:
-        hand: Whose triangles they are.
+        hand: Model of the surface.
         vertices: In poses [m].
         side: The faces of a left hand wind the other way.
         bent: Largest change of an angle [rad] from a pose in which nothing gives way; from `FREE` on it does wholly.
@@ -65,7 +64,7 @@ def giving_way(
 
 @functools.cache
 def contact_tables(device: torch.device) -> ContactTables:
-    """Those of the bundled hand, whose triangles all hands have."""
+    """Tables of the bundled hand; all hands share its triangles."""
     hand = bundled_hand()
     points, faces = hand.template.double().numpy(), hand.faces.numpy()
     edges = surface.mesh_edges(hand.faces).numpy()
@@ -91,7 +90,7 @@ def contact_tables(device: torch.device) -> ContactTables:
         "samples": face[members[starts[:-1, None] + np.diff(starts)[:, None] * np.arange(SAMPLES) // SAMPLES]],
         "beside": _beside(part[near.row], part[near.col], n_parts),
         "allowed": _may_touch(hand, part, edges),
-        "give": np.minimum(LIMIT, FLESH * _thickness(hand)) * (1 - rigid).clip(0),
+        "give": np.minimum(LIMIT, YIELD * _thickness(hand)) * (1 - rigid).clip(0),
         "offsets": around.indptr,
         "neighbours": around.indices,
         "weights": around.data,
@@ -104,7 +103,7 @@ def contact_tables(device: torch.device) -> ContactTables:
 
 
 def _patches(hand: HandModel) -> tuple[np.ndarray, np.ndarray]:
-    """The vertices in patches, and the first of each patch: one bone's, halved until they are small and nearly flat."""
+    """The vertices in patches, and the first of each: parts of one bone, small and nearly flat."""
     normals = surface.vertex_normals(hand.template, hand.faces)
     places = torch.cat([hand.template, SPACING * normals], 1).double().numpy()
     waiting = [np.flatnonzero(hand.segment.numpy() == bone) for bone in reversed(range(len(hand.parents)))]
@@ -121,7 +120,7 @@ def _patches(hand: HandModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _beside(a: np.ndarray, b: np.ndarray, n_parts: int) -> np.ndarray:
-    """The patches b of pairs by their patches a, itself first, filled up with -1."""
+    """The patches beside each patch, itself first, filled up with -1; given as pairs of patches."""
     rank = np.full((n_parts, n_parts), 2)
     rank[a, b] = 1
     np.fill_diagonal(rank, 0)
@@ -130,7 +129,7 @@ def _beside(a: np.ndarray, b: np.ndarray, n_parts: int) -> np.ndarray:
 
 
 def _may_touch(hand: HandModel, part: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Which patches may touch each other in some pose, as bits: not those of one bone, nor two sides of a finger."""
+    """Bits that say which patches may touch in some pose: not those of one bone, nor two sides of a finger."""
     n_parts = part.max() + 1
     normals = surface.vertex_normals(hand.template, hand.faces)
     sums = np.zeros((n_parts, 7))
@@ -150,7 +149,7 @@ def _may_touch(hand: HandModel, part: np.ndarray, edges: np.ndarray) -> np.ndarr
 
 
 def _thickness(hand: HandModel) -> np.ndarray:
-    """Distance of each vertex at rest from the axis of its finger's bone [m]; the palm's has no end."""
+    """Distance of each vertex at rest from the axis of its finger's bone [m]; infinite on the palm."""
     joints, tips, points = (part.double().numpy() for part in (hand.joints, hand.tips, hand.template))
     found = np.full(len(points), np.inf)
     for joint in range(1, len(joints)):

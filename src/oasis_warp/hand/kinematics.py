@@ -202,7 +202,7 @@ class HandKinematics:
 
 @functools.cache
 def bundled_kinematics() -> HandKinematics:
-    """Of the bundled mean hand."""
+    """Kinematics of the bundled mean hand."""
     return HandKinematics(bundled_hand())
 
 

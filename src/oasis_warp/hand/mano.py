@@ -25,9 +25,9 @@ N_HD_VERTICES, N_HD_FACES = 12_337, 24_608
 N_RIM = 16
 PARENTS = (-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14)
 TIP_VERTICES = (744, 320, 443, 554, 671)
-"""Of thumb, index, middle, ring and little finger, as smplx numbers them; manopth takes others."""
+"""Tips of thumb, index, middle, ring and little finger, as smplx numbers them; manopth takes others."""
 SMOOTHING_PASSES = 3
-"""Of MANO-HD's template, as in HandAvatar (Chen et al. 2023)."""
+"""Smoothing passes of MANO-HD's template, as in HandAvatar (Chen et al. 2023)."""
 FARTHEST = 0.5
 """Largest coordinate of a template [m]; files in millimetres are beyond it."""
 SAME_SHAPES = 1e-6
@@ -51,7 +51,7 @@ class ManoModel:
     regressor: np.ndarray
     """Joints are these means of the shaped vertices, [16, 778]."""
     coarse_template: np.ndarray
-    """Of the file itself, from which the joints come, [778, 3]."""
+    """Template of the file itself; the joints come from it, [778, 3]."""
     coarse_shapes: np.ndarray
     """[778, 3, 10]."""
     weights: np.ndarray
@@ -156,7 +156,7 @@ def hand_pose(model: ManoModel, values: np.ndarray, *, flat_hand_mean: bool) -> 
     """The 45 angles of MANO [rad], [15, 3], from principal components or from angles without the mean pose.
 
     Args:
-        model: Whose components and mean pose they refer to.
+        model: The model whose components and mean pose they refer to.
         values: 45 angles, [45] or [15, 3]; or the first n components, [n].
         flat_hand_mean: Whether zeros mean the flat hand, as with smplx's option of that name; else the mean pose.
 

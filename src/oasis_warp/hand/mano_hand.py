@@ -83,7 +83,7 @@ def step_to_points(
         index: Vertices, [P].
         points: Where they should lie [m], [P, 3].
         normals: Count only distances along these, [P, 3].
-        sigma: Of the distances [m].
+        sigma: Sigma of the distances [m].
     """
     joints, dofs = hand.joints(kinematics), tuple(kinematics.dofs.T)
     moved = kinematics.correctives(hand.angles)[index]
@@ -129,7 +129,7 @@ def fit_vertices(
         kinematics: The hand model.
         vertices: Points [m], [V, 3].
         start: Where to start; at rest, aligned with the points, when not given.
-        steps: Of Gauss and Newton, on every fourth vertex.
+        steps: Gauss-Newton steps on every fourth vertex.
     """
     index = np.arange(0, len(vertices), 4)
     if start is None:
@@ -151,7 +151,7 @@ _NEAR_VERTICES = 3
 _RIM = 10.0
 """Weight of the wrist's rim."""
 MAX_TURNED = 40.0
-"""Of the palm against the bundled hand's, which lies as MANO's [degrees]."""
+"""Largest rotation of the palm against the bundled hand's, which lies as MANO's [degrees]."""
 WORST_FIT = 0.004
 """Root of the mean squared distance, after fitting, above which the template is no hand as MANO's [m]."""
 

@@ -93,12 +93,12 @@ def local_quats(
 ) -> Float[Tensor, "T J 4"]:
     """Rotation of each joint in the frame of its parent, wxyz, in poses of these joint angles [rad].
 
-    A hand that stays in place: orientation and translation of a pose are no joint's. Neighbours in time have the same
+    The hand stays in place: orientation and translation of a pose belong to no joint. Neighbours in time have the same
     sign, so that they can be interpolated.
     """
     n = len(angles)
-    still = HandPose(angles, torch.eye(3).expand(n, 3, 3).to(angles), angles.new_zeros(n, 3))
-    rotations, _ = bone_transforms(hand, rest.joints, still)
+    at_origin = HandPose(angles, torch.eye(3).expand(n, 3, 3).to(angles), angles.new_zeros(n, 3))
+    rotations, _ = bone_transforms(hand, rest.joints, at_origin)
     to_file = torch.tensor(TO_WEBXR[side]).to(angles)
     world = to_file @ rotations[:, list(rig.bones)] @ to_file.T @ rig.bind[:, :3, :3]
     upper = torch.stack([torch.eye(3).expand(n, 3, 3).to(world) if p < 0 else world[:, p] for p in rig.parents], 1)

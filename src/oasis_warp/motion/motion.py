@@ -15,10 +15,10 @@ from oasis_warp.core.rotation import euler_angles
 from oasis_warp.core.types import HandPose
 
 CUTOFF = 6.0
-"""Of the low pass [Hz]: the usual one for recorded human movement (Winter, Biomechanics and Motor Control of Human
-Movement, 2009, section 3.4.4)."""
+"""Cut-off of the low pass [Hz], the usual one for recorded human movement (Winter, Biomechanics and Motor Control of
+Human Movement, 2009, section 3.4.4)."""
 ORDER = 2
-"""Of the filter, which runs forwards and backwards, so that nothing lags behind."""
+"""Order of the filter. It runs forwards and backwards, so that nothing lags behind."""
 
 
 class Motion(NamedTuple):

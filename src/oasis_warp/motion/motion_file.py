@@ -31,7 +31,7 @@ from oasis_warp.motion.bvh import hand_angles, read_bvh
 from oasis_warp.motion.motion import Motion, angles_of_bones, joint_angles
 
 N_JOINTS = 25
-"""Of WebXR (www.w3.org/TR/webxr-hand-input-1, XRHandJoint); OpenXR's XrHandJointEXT has the palm before them."""
+"""Joints of WebXR (www.w3.org/TR/webxr-hand-input-1, XRHandJoint); OpenXR's XrHandJointEXT has the palm before them."""
 HALF_TURN = (1.0, -1.0, -1.0)
 """Diagonal of the turn from y up and z to the viewer to y down and z forward."""
 
@@ -46,9 +46,9 @@ def read_tracked(
     Args:
         hand: The model of this `side`.
         rest: Its shape at rest.
-        side: Of the hand that was tracked.
+        side: Side of the hand that was tracked.
         quats: Directions of the joints in the room, x, y, z, w as WebXR and OpenXR write them, [T, 25 or 26, 4].
-        places: Of the joints in the room [m], [T, 25 or 26, 3].
+        places: Places of the joints in the room [m], [T, 25 or 26, 3].
 
     Raises:
         ValueError: another shape.
@@ -96,7 +96,7 @@ def read_mano(
         get: The file's parts.
         hand: The model of the file's `side`.
         rest: Its shape at rest.
-        side: Of the hand that the parameters describe.
+        side: Side of the hand that the parameters describe.
         ours: Whether `transl` is that of our frame, about whose origin the wrist turns, and not that of smplx.
 
     Raises:
@@ -154,7 +154,7 @@ MOTION_SUFFIXES = (".json", ".npz", ".bvh", *VIDEO_SUFFIXES)
 USUAL_FPS = 30.0
 MAX_FRAMES = 100_000
 MAX_BYTES = 1 << 28
-"""Of a file with motions: hours of one."""
+"""Largest file with motions: hours of one."""
 LARGEST_ANGLE = 2 * np.pi
 """Beyond it angles are degrees, taken for radians."""
 TRACKED = ("orientations", "positions")
@@ -167,7 +167,7 @@ def read_motion(path: Path | str, avatar: Avatar, *, progress: Progress = silent
     Args:
         path: File; its ending says what it is.
         avatar: Who will move so: its side says which of two hands is read, and its bones lie where tracked ones do.
-        progress: Of a video.
+        progress: Called as a video is read.
 
     Raises:
         InputError: no such file, not a motion, or a video that shows no such hand.

@@ -12,7 +12,7 @@ MOST = {
 }  # fmt: skip
 """Largest sizes, a few times the paper's: a weights file is untrusted, and its sizes determine the memory."""
 MAX_LETTERS = 80
-"""Of a profile's name."""
+"""Most letters of a profile's name."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -49,7 +49,7 @@ STAGES = ((64, 2), (128, 2), (256, 3))
 FINE = 12
 """Learned channels at full resolution, beside the colours themselves."""
 MEAN, SPREAD = 0.5, 0.25
-"""Of skin's sRGB values, roughly; the encoder sees (image - MEAN) / SPREAD."""
+"""Rough mean and spread of skin's sRGB values; the encoder sees (image - MEAN) / SPREAD."""
 
 
 class ChannelNorm(nn.LayerNorm):
@@ -121,7 +121,7 @@ IMAGENET_MEAN, IMAGENET_SPREAD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class Size(NamedTuple):
-    """Of one vision transformer."""
+    """Size of one vision transformer."""
 
     width: int
     layers: int

@@ -63,7 +63,7 @@ class Described(NamedTuple):
     """Inputs of the heads, for B hands."""
 
     features: Float[Tensor, "B V C"]
-    """Of the points."""
+    """Features of the points."""
     colors: Float[Tensor, "B V 3"]
     """Mean colours in the photo's tone."""
     seen: Float[Tensor, "B V 3"] | None
@@ -232,6 +232,6 @@ class HandNetwork(nn.Module):
 
 
 def _mean_color(observation: Observation) -> Float[Tensor, "B 3"]:
-    """Of what is seen well."""
+    """Mean colour of what is seen well."""
     weight = observation.confidence[..., None]
     return (weight * observation.colors).sum(1) / weight.sum(1).clamp_min(1)

@@ -135,7 +135,7 @@ def decode_offsets(raw: dict[str, Tensor]) -> Float[Tensor, "B V 3"]:
 
 
 COLOR_OUTPUTS = ("colors", "trust")
-"""Of a head, where it has them."""
+"""Outputs of a head that make colours, where it has them."""
 
 
 class HeadCache(NamedTuple):
@@ -157,7 +157,7 @@ class HeadCache(NamedTuple):
 
 
 ColorHeads = tuple[HeadCache, ...]
-"""Of the vertices' Gaussians, then of the faces' where these have a head: all of a guess, in its order."""
+"""Cache of the vertices' Gaussians, then of the faces' where these have a head: all of a guess, in its order."""
 
 LowRank = list[tuple[Tensor, Tensor]]
 """A head's updates, one a layer: A of shape [rank, inputs] and the transpose of B, [rank, outputs]; the layer's weight
@@ -179,7 +179,7 @@ def cache_head(
         features: What it is asked.
         colors: Mean colours of the same points.
         seen: The photo's difference from them, if the head puts out how far to trust it.
-        rows: Whose colour each Gaussian has.
+        rows: The row whose colour each Gaussian has.
     """
     inputs = head.norm(features[rows])
     ends = torch.tensor(list(head.outputs.values())).cumsum(0).tolist()
@@ -202,8 +202,8 @@ def zero_updates(cache: HeadCache, rank: int | None, random: torch.Generator) ->
     Without a rank A is the identity, and wants no gradient: B A may be any matrix.
 
     Args:
-        cache: Of the head.
-        rank: Of B A; None for all weights.
+        cache: Cache of the head.
+        rank: Rank of B A; None for all weights.
         random: On the CPU, so that every device starts alike.
     """
     hidden = cache.first.shape[1]

@@ -77,8 +77,9 @@ def clamp_to_surface(prediction: Prediction, on: RestSurface) -> Prediction:
 
 
 COVERING_OPACITY = 0.8
-"""Of a vertex's Gaussian. That is what the network gives to nine in ten on faces; half of those on vertices have less
-than .35, and where a bent finger stretched its skin a quarter of what was drawn was the inside of its other side."""
+"""Opacity of a vertex's Gaussian that covers the surface. The network gives as much to nine in ten on faces; half of
+those on vertices have less than .35, and where a bent finger stretched its skin a quarter of what was drawn was the
+inside of its other side."""
 
 
 def cover_surface(prediction: Prediction, on: RestSurface) -> Prediction:
@@ -117,7 +118,7 @@ def cover_surface(prediction: Prediction, on: RestSurface) -> Prediction:
 def distance_from_rim(
     rest: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], rim: Int[Tensor, "R"]
 ) -> Float[Tensor, "N"]:
-    """Of every vertex and face from the open wrist [m]."""
+    """Distance of every vertex and face from the open wrist [m]."""
     at_vertices = torch.cdist(rest, rest[rim]).amin(1)
     return torch.cat([at_vertices, at_vertices[faces].amin(1)])
 
@@ -125,7 +126,7 @@ def distance_from_rim(
 def color_sources(
     rest: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], from_rim: Float[Tensor, "N"]
 ) -> Int[Tensor, "N"]:
-    """Whose colour each vertex, and each face if it carries a Gaussian, takes.
+    """The vertex or face from which each vertex, and each face with a Gaussian, takes its colour.
 
     Where Gaussians fade out at the wrist, that is the nearest one that does not; `from_rim` holds their distances from
     the open wrist [m].

@@ -37,7 +37,7 @@ class Aggregation(nn.Module):
         """Logarithm of the fall-off, in cells: one cell at first."""
 
     def weights(self) -> tuple[Float[Tensor, "K K"], Float[Tensor, "K K"]]:
-        """The weights w = exp(-d / sigma), whose sum is left to the samples that count, and dw / d log sigma."""
+        """The weights w = exp(-d / sigma), not yet normalised over the samples that count, and dw / d log sigma."""
         offset = torch.arange(-self.reach, self.reach + 1, dtype=self.log_sigma.dtype, device=self.log_sigma.device)
         with torch.no_grad():
             distance = torch.hypot(offset[:, None], offset) / self.log_sigma.exp()

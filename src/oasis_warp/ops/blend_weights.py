@@ -72,8 +72,8 @@ def blend_weights(
         opacities: In [0, 1], shape [N].
         viewmat: World to camera, shape [4, 4].
         K: Intrinsics [px], shape [3, 3].
-        width: Of the image [px].
-        height: Of the image [px].
+        width: Width of the image [px].
+        height: Height of the image [px].
         near_plane: This and the rest as in `rasterization`.
         far_plane: See there.
         radius_clip: See there.
@@ -136,7 +136,7 @@ def stack_weights(views: Sequence[BlendWeights]) -> BlendWeights:
     `blend_colors(stacked, torch.cat([colors of each]))` draws them all, each in colours of its own.
 
     Args:
-        views: Of equal width, on one device.
+        views: Views of equal width, on one device.
 
     Raises:
         TypeError: another type.
@@ -215,7 +215,7 @@ def blend_colors(
     Torch's own gradient of a sparse product transposes the matrix at every step, at sixty times the cost.
 
     Args:
-        weights: Of `blend_weights`.
+        weights: Weights of `blend_weights`.
         colors: One row for each Gaussian.
         validate: Refuse colours that are not finite. Waits for a CUDA device; switch it off for trusted inputs.
 

@@ -11,7 +11,8 @@ DEVICES = "cpu", "cuda"
 WHOLE = int, torch.SymInt
 NUMBERS = int, float, torch.SymInt, torch.SymFloat
 MAX_SIDE = 2**23
-"""Of an image or a tile [px]: float32 counts halves of pixels up to there, and products with 2^8 fit in int32."""
+"""Largest side of an image or a tile [px]: float32 counts halves of pixels up to there, and products with 2^8 fit in
+int32."""
 FINITE_LIMIT = 1e15
 """Largest accepted magnitude: its square still fits in float32."""
 

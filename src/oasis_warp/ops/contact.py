@@ -24,11 +24,11 @@ MARGIN = 0.0005
 FADES = 0.5
 """Share of the skin around a vertex that touches, below which its shift fades: that at the edge of a contact."""
 ROUNDS = 3
-"""Of giving way; later ones make up for what their mean took from the first."""
+"""Rounds of contact resolution; later ones make up for what the mean took from the first."""
 PAD = 0.003
-"""Around the flesh under a part, whose normals differ from its own: as far as they lead aside [m]."""
+"""Margin around a part's box [m]: normals of the flesh below differ from the part's own and lead that far aside."""
 MIN_PARTS = 64
-"""Parts for which another thread is worth its while."""
+"""Least parts for which another thread pays."""
 
 
 class ContactTables(NamedTuple):
@@ -39,7 +39,7 @@ class ContactTables(NamedTuple):
     starts: Int[Tensor, "P+1"]
     """First place of each of P parts there; parts in a row, `GROUP` a group, lie near each other."""
     part: Int[Tensor, "V"]
-    """Of each vertex."""
+    """Part of each vertex."""
     samples: Int[Tensor, "P E"]
     """Some faces of each part."""
     beside: Int[Tensor, "P A"]
@@ -73,9 +73,9 @@ def contact_shifts(
     bits for a surface in a batch as alone. Float32; values are trusted; not differentiable.
 
     Args:
-        vertices: Of posed surfaces [m].
+        vertices: Vertices of posed surfaces [m].
         faces: Corners.
-        tables: Of that surface.
+        tables: Tables of that surface.
         mirrored: Whether faces wind the other way.
 
     Raises:

@@ -155,8 +155,8 @@ class RecordedRasterization:
         """Nothing is captured yet.
 
         Args:
-            width: Of the images [px].
-            height: Of the images [px].
+            width: Width of the images [px].
+            height: Height of the images [px].
             options: Arguments of `rasterization` that are not tensors, except `validate`.
         """
         self._size = width, height
@@ -326,7 +326,7 @@ def replayed(
         record: Makes a `CapturedGraph`, if there is none under `key` or the last one's memory did not suffice.
         exact: The function itself.
         inputs: Small tensors, on any device.
-        names: Of the inputs that `CapturedGraph` has `checked`, to look at their values.
+        names: Names of the inputs that `CapturedGraph` has `checked`, to look at their values.
 
     Raises:
         ValueError: an input with a name is not finite.

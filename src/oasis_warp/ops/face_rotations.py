@@ -20,7 +20,7 @@ class RestMesh(NamedTuple):
 
     vertices: Float[Tensor, "V 3"]
     triangles: Float[Tensor, "T 12"]
-    """The frame and shape of every face as the kernels read them; T is 0 in float64, whose kernels do without."""
+    """The frame and shape of every face as the kernels read them; T is 0 in float64, as its kernels need none."""
 
 
 class FaceRotations(NamedTuple):

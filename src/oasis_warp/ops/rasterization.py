@@ -122,8 +122,8 @@ def rasterization(
             shape [N, K, 3] or [C, N, K, 3].
         viewmats: World to camera (OpenCV axes), shape [C, 4, 4]; the last row is not read.
         Ks: Intrinsics [px], shape [C, 3, 3]; skew is not read.
-        width: Of the images [px].
-        height: Of the images [px].
+        width: Width of the images [px].
+        height: Height of the images [px].
         near_plane: Gaussians whose centre is nearer are not drawn [m].
         far_plane: Nor are those farther than this [m].
         radius_clip: Nor those whose box has both half sides at or below this [px].

@@ -16,18 +16,18 @@ from oasis_warp.ops.depth_map import depth_map
 from oasis_warp.ops.smoothing import smooth_over_faces
 
 N_DIRECTIONS = 32
-"""Of `sky_directions`."""
+"""Number of `sky_directions`."""
 SIZE = 64
 """Side of the depth buffers [px]: 3 mm of a hand's 20 cm."""
 DISTANCE = 50.0
-"""Of their cameras, in radii of the surface: the rays are nearly parallel."""
+"""Distance of their cameras, in radii of the surface: the rays are nearly parallel."""
 MARGIN = 1.03
 """Radius that a buffer shows, in radii of the surface."""
 FOCAL = DISTANCE * SIZE / 2
 MIN_TASKS = 256
 """Vertices for which another thread is worth its while."""
 LIFT = 0.002
-"""Off the surface from which points look, and length of the ramp from seen to hidden [m]."""
+"""Distance off the surface from which points look, and length of the ramp from seen to hidden [m]."""
 
 
 class Sky(NamedTuple):
@@ -86,7 +86,7 @@ def sky_exposure(
     same on every device and in a batch as alone up to rounding; to the bit on the CPU.
 
     Args:
-        vertices: Of posed surfaces [m], float32, [B, V, 3].
+        vertices: Vertices of posed surfaces [m], float32, [B, V, 3].
         normals: Unit, [B, V, 3].
         faces: Corners, [F, 3].
         frames: Rotations that turn the directions, [B, 3, 3]: if they turn with the surface, so does the result.
@@ -131,5 +131,5 @@ def sky_exposure(
 
 @functools.cache
 def _intrinsics(device: torch.device) -> Float[Tensor, "3 3"]:
-    """Of the buffers' cameras; kept, because a graph must not copy them from the host."""
+    """Intrinsics of the buffers' cameras; kept, because a graph must not copy them from the host."""
     return torch.tensor([[FOCAL, 0, SIZE / 2], [0, FOCAL, SIZE / 2], [0, 0, 1]], device=device)

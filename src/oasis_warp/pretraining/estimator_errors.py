@@ -27,7 +27,7 @@ from oasis_warp.hand.template import bundled_hand
 from oasis_warp.pretraining.hand_batch import FINGERS, PosedHands, pose_hands
 
 ALIKE = 8
-"""Number of most similar measured hands of which one provides the error."""
+"""Number of most similar measured hands; one of them provides the error."""
 _WRIST, _MIDDLE = 0, 9
 """Landmarks that define the direction of a hand."""
 _BONES = (*((0, k) for k in range(1, 21, 4)), *((k, k + 1) for k in range(1, 20) if k % 4))

@@ -63,7 +63,7 @@ class PretrainConfig:
     decay: Literal["cosine", "cooldown", "none"] = "cosine"
     """Decay to 0 at the last step, over all steps or linearly over the last `COOLDOWN`, or constant as in the paper."""
     precision: Literal["bfloat16", "float32"] = "bfloat16"
-    """Of attention and perceptrons; geometry, Gaussians and weights are float32."""
+    """Precision of attention and perceptrons; geometry, Gaussians and weights are float32."""
     clip: float = 1.0
     """Norm to which the gradient of all weights is clipped."""
     checkpoint_every: int = 500
@@ -258,14 +258,19 @@ def pretrain(
             reported, skipped = trainer.step, numbers["skipped"]
             if process.rank == 0:
                 seconds = (time.perf_counter() - start) / (trainer.step - first)
-                finite = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
-                with (folder / METRICS).open("a") as file:
-                    file.write(json.dumps({"step": trainer.step, "seconds_per_step": seconds, **finite}) + "\n")
+                _append_line(folder / METRICS, {"step": trainer.step, "seconds_per_step": seconds, **numbers})
         if process.rank == 0 and save_now:
             trainer.save(folder / CHECKPOINT)
             trainer.save_weights(folder / WEIGHTS, {"step": trainer.step, **notes})
             _write_sheet(folder / SHEET, trainer.sheet(batch, result))
     return trainer.step
+
+
+def _append_line(path: Path, numbers: Mapping[str, int | float]) -> None:
+    """Append a line of JSON to `path`, with null for what is not finite."""
+    finite = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
+    with path.open("a") as file:
+        file.write(json.dumps(finite) + "\n")
 
 
 def _write_sheet(path: Path, columns: Sequence[Tensor]) -> None:
@@ -298,7 +303,7 @@ def _step_of(line: bytes) -> int | float:
 FORMAT = "oasis-pretraining"
 MOMENTS = ("exp_avg", "exp_avg_sq")
 MAX_STEPS = 1 << 24
-"""Of a training; float32 counts no further, and Adam counts in it."""
+"""Most steps of a training; float32 counts no further, and Adam counts in it."""
 
 
 def save_checkpoint(

@@ -58,9 +58,9 @@ class EstimatorNoise:
     """Strength of the estimator's errors in the network's input: 1 as measured, 0 for none."""
 
     surface: float = 1.0
-    """Of errors in pose, shape and camera."""
+    """Strength of errors in pose, shape and camera."""
     mask: float = 1.0
-    """Of errors in the mask, and so in the crop around it."""
+    """Strength of errors in the mask, and so in the crop around it."""
 
 
 class Crops(NamedTuple):
@@ -159,7 +159,7 @@ def training_batch(
     alone = goal_image * (goal_mask / goal_alpha.clamp_min(1e-3)).clamp(0, 1)[..., None]  # over black already
     hidden = (goal_alpha - goal_mask).clamp(0, 1)
     cut = crop_to_mask(torch.cat([alone, torch.stack([goal_mask, hidden], -1)], dim=-1), goal_mask, goal_K, size)
-    still = torch.eye(4, dtype=like.dtype, device=like.device)
+    eye = torch.eye(4, dtype=like.dtype, device=like.device)
 
     def per_hand(tensor: Tensor) -> Tensor:
         return tensor.unflatten(0, (count, views))
@@ -168,13 +168,13 @@ def training_batch(
         image=crop.planes[..., :3].clamp(0, 1),
         mask=perturb_outline(crop.planes[..., 3].clamp(0, 1), numbers[:, 1:], noise.mask),
         posed=seen.posed,
-        viewmat=still.expand(count, -1, -1),
+        viewmat=eye.expand(count, -1, -1),
         K=crop.K,
         rest=true.rest,
         target_images=per_hand(cut.planes[..., :3].clamp(0, 1)),
         target_masks=per_hand(cut.planes[..., 3].clamp(0, 1)),
         target_known=per_hand(1 - cut.planes[..., 4].clamp(0, 1)),
         target_posed=per_hand(both.posed[count:]),
-        target_viewmats=still.expand(count, views, -1, -1),
+        target_viewmats=eye.expand(count, views, -1, -1),
         target_Ks=per_hand(cut.K),
     )

@@ -14,7 +14,7 @@ DAMPING = 0.5e-6
 RIGHT_ANGLE = 1e-4
 """Dot product of two quaternions below which rounding may decide the sign of one."""
 EXPONENTS = {"sqrt_area": 0.5, "area": 1.0, "none": 0.0}
-"""Of the area ratio, by scale law."""
+"""Exponent of the area ratio, by scale law."""
 LIMIT = 1e4
 """Area ratios are clamped to this and its inverse before they act on scales."""
 

@@ -60,7 +60,7 @@ class Splats(NamedTuple):
     """Gaussians on the image plane: those between the planes and not too faint, nearest first."""
 
     index: Int[Tensor, "M"]
-    """Which Gaussians they are."""
+    """Indices of the Gaussians."""
     centers: Float[Tensor, "M 2"]
     """[px]."""
     covars: Float[Tensor, "M 3"]

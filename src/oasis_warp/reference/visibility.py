@@ -29,7 +29,7 @@ class Rays(NamedTuple):
     edges: Tensor
     """Normals of the planes through the camera and the edges of the faces [F, 3, 3]."""
     normals: Tensor
-    """Of the faces, twice their areas long [F, 3]."""
+    """Normals of the faces, twice their areas long [F, 3]."""
     degenerate: Tensor
     """[F]"""
     weights: Tensor
@@ -38,7 +38,7 @@ class Rays(NamedTuple):
     """-1 where the ray lies in the plane of the face or the face is degenerate."""
     pixel: Tensor
     face: Tensor | None
-    """Of a list."""
+    """Face of each pair, where rays and faces are listed."""
 
 
 class Hits(NamedTuple):
@@ -177,7 +177,7 @@ def score_points(
 def stable_points(
     points: Tensor, known: Certainty, camera: Camera, named: bool, near_plane: float = 0.01, slack: float = 1.0
 ) -> Tensor:
-    """Which points [P] have a score that does not depend on rounding; `named` if `point_vertices` are given."""
+    """Whether the score of each point [P] does not depend on rounding; `named` if `point_vertices` are given."""
     xy, z = pixels_of(points, camera)
     size = torch.tensor([camera.width, camera.height], device=points.device)
     border = (xy - xy.round()).abs() <= slack * EDGE_PIXELS + 1e-6 * xy.abs()

@@ -104,9 +104,9 @@ class Body:
     materials: Int[Tensor, "F"]
     """int32: SKIN, SLEEVE, BAND or RING."""
     uv: Float[Tensor, "U 2"]
-    """Of hand and forearm, in [0, 1]."""
+    """Texture coordinates of hand and forearm, in [0, 1]."""
     uv_faces: Int[Tensor, "S 3"]
-    """Of the faces of skin, which come first."""
+    """Texture corners of the faces of skin; these faces come first."""
     n_hand_faces: int
     n_vertices: int
     rest: Float[Tensor, "K 3"]
@@ -189,8 +189,8 @@ def skin_mesh(hand: HandModel) -> SkinMesh:
     u, v = np.meshgrid(np.linspace(0.01, 0.99, columns + 1), ATLAS_HAND_SHARE + rise)
     uv = np.concatenate([hand.uv.numpy() * [1, ATLAS_HAND_SHARE], np.stack([u, v], -1).reshape(-1, 2)])
 
-    still = torch.eye(3).expand(1, ARM_ROWS, 3, 3)
-    rows = arm_rows(hand.template[hand.rim][None], still, torch.tensor([0.4]))[0]
+    eye = torch.eye(3).expand(1, ARM_ROWS, 3, 3)
+    rows = arm_rows(hand.template[hand.rim][None], eye, torch.tensor([0.4]))[0]
     rest = torch.cat([hand.template, rows.reshape(-1, 3)])
     corners = rest.numpy()[arm_faces[len(arm_faces) // 2]]
     outward = corners[0] - rows[ARM_ROWS // 2].mean(0).numpy()

@@ -19,7 +19,7 @@ import numpy as np
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.synthetic.body import FINGERS, THUMB, Body, bundled_body
 
-FLESH = 1.0
+ALLOWED_OVERLAP = 1.0
 """Penetration that soft tissue allows [mm]."""
 ROUNDS = 22
 _PLACES = (0.12, 0.37, 0.63, 0.88)
@@ -46,7 +46,7 @@ class Balls(NamedTuple):
     column: np.ndarray
     """Index into `starts` for two groups, [6, 6]."""
     allowed: np.ndarray
-    """Allowed penetration of each pair: that at rest plus `FLESH` [mm], [P]."""
+    """Allowed penetration of each pair: that at rest plus `ALLOWED_OVERLAP` [mm], [P]."""
 
 
 @functools.cache
@@ -82,7 +82,7 @@ def bundled_balls() -> Balls:
     kinds, starts = np.unique(groups[order], axis=0, return_index=True)
     column = np.zeros((6, 6), int)
     column[kinds[:, 0], kinds[:, 1]] = column[kinds[:, 1], kinds[:, 0]] = np.arange(len(kinds))
-    allowed = np.maximum(-gap, 0) + FLESH
+    allowed = np.maximum(-gap, 0) + ALLOWED_OVERLAP
     return Balls(joint, center, radius, group, pairs[order], starts, column, allowed[order])
 
 

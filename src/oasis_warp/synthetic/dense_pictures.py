@@ -49,11 +49,11 @@ def render_dense(
     """Render the shots of `table` (see `picture.render_table`) with disturbances.
 
     Args:
-        seed: Of the world.
+        seed: Seed of the world.
         table: What to render; all hands are shown as right hands.
         size: Width and height [px].
         device: Where to render.
-        scene: That of the table.
+        scene: Options of the table.
         random: Generator of the disturbances, on the device.
     """
     batch = shade_batch(seed, table, size, torch.device(device), scene.population, lamps=True)

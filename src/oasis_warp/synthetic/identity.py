@@ -51,7 +51,7 @@ class Identity(NamedTuple):
     veins: float
     mottle: float
     line_depth: float
-    """Of the palm's lines, .6 to 1.4."""
+    """Depth of the palm's lines, .6 to 1.4."""
     line_wealth: float
     knuckles: float
     """Depth of the folds over the joints, .5 to 1.5."""

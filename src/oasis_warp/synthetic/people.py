@@ -197,8 +197,8 @@ def _finish_person(plan: SkinPlan, device: str) -> Person:
     rest = smooth + body.normals[: body.n_hand] * relief(identity, device)[:, None]
     joints, tips = hand.joints + hand.joint_basis @ shape, hand.tips + hand.tip_basis @ shape
     texture = bake_texture(plan, device)
-    still = torch.eye(3, device=device).expand(1, ARM_ROWS, 3, 3)
-    arm = arm_rows(rest[hand.rim][None], still, torch.tensor([identity.arm_girth], device=device))
+    eye = torch.eye(3, device=device).expand(1, ARM_ROWS, 3, 3)
+    arm = arm_rows(rest[hand.rim][None], eye, torch.tensor([identity.arm_girth], device=device))
     whole = torch.cat([rest, arm.reshape(-1, 3)])[None]
     return Person(
         identity,

@@ -121,7 +121,7 @@ def render_capture(
     """Render one photo, and pictures of the bare hand over black in its light and exposure, by an ideal camera.
 
     Args:
-        seed: Of the world.
+        seed: Seed of the world.
         photo: One shot with background and sensor.
         others: Shots of `shots.capture_shots` with this photo.
         size: Side of all pictures [px].
@@ -151,7 +151,7 @@ class ShadedBatch(NamedTuple):
     seen: DepthMap
     """The body's mesh at `SAMPLES` times the size."""
     normals: Float[Tensor, "B V 3"]
-    """Of the posed vertices, in the camera's frame."""
+    """Normals of the posed vertices, in the camera's frame."""
     lamps: Lamps
     shaded: Shaded
 
@@ -168,8 +168,8 @@ def shade_batch(
     posed = pose_people(body, people, numbers)
     fine = size * SAMPLES
     K = pinhole(posed.focal * fine, fine)
-    still = torch.eye(4, device=device).expand(len(people), 4, 4)
-    seen = depth_map(posed.vertices, body.faces, still, K, fine, fine, validate=False)
+    eye = torch.eye(4, device=device).expand(len(people), 4, 4)
+    seen = depth_map(posed.vertices, body.faces, eye, K, fine, fine, validate=False)
     state = surface_state(posed.vertices, body.faces)
     lit = light_lamps(body, posed, numbers) if lamps else no_lamps(posed.vertices)
     shaded = shade_skin(

@@ -25,7 +25,7 @@ class PosedPeople(NamedTuple):
     """In the order of `body.Body`."""
     landmarks: Float[Tensor, "B 21 3"]
     translation: Float[Tensor, "B 3"]
-    """Of the hand's frame; with the view's rotation the hand's pose."""
+    """Translation of the hand's frame; with the view's rotation the hand's pose."""
     focal: Float[Tensor, "B"]
     """Focal length over the width of the picture."""
     center: Float[Tensor, "B 3"]
@@ -57,7 +57,7 @@ def pose_people(body: Body, people: Sequence[Person], numbers: ShotTensors) -> P
     Args:
         body: On the people's device.
         people: One per image.
-        numbers: Of the same images.
+        numbers: Numbers of the same images.
     """
     hand = body.hand
     rest, joints, tips, ring = (torch.stack([getattr(p, name) for p in people])

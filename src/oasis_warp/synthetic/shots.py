@@ -75,9 +75,9 @@ class Shot(NamedTuple):
     side: Side
     gesture: str
     angles: np.ndarray
-    """Of all joints about the pose axes [rad], 0 at rest, [16, 3]."""
+    """Angles of all joints about the pose axes [rad], 0 at rest, [16, 3]."""
     bend: np.ndarray
-    """Of the forearm at the wrist: an axis with the angle as its length [rad], [3]."""
+    """Bend of the forearm at the wrist: an axis with the angle as its length [rad], [3]."""
     view: View
     light: Light
     clothes: Clothes

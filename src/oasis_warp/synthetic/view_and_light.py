@@ -155,7 +155,7 @@ def rotate_light(light: Light, rotation: np.ndarray) -> Light:
 
 
 def diffuse_light(light: Light, share: float) -> Light:
-    """The same amount and colour of light, of which `share` keeps its directions and the rest is uniform."""
+    """The same amount and colour of light: `share` of it keeps its directions, the rest is uniform."""
     sky = share * light.sky
     sky[0] = light.sky[0] + 0.65 * (1 - share) * light.colors.sum(0) / 0.2820948
     return light._replace(sky=sky, colors=share * light.colors)

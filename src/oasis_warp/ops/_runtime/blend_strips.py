@@ -30,7 +30,7 @@ class Strips(NamedTuple):
     across: int
     down: int
     n_strips: int
-    """Of all cameras."""
+    """Strips of all cameras."""
     plane: int
     """Floats of a strip's plane."""
     n_chunks: int

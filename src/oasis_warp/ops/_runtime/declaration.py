@@ -73,7 +73,7 @@ class Declaration:
         """Declare an operator.
 
         Args:
-            name: Of the operator; a public one is `oasis_warp.ops.NAME`.
+            name: Name of the operator; a public one is `oasis_warp.ops.NAME`.
             inputs: Its tensor arguments, by the names under which messages speak of them.
             outputs: Shapes of its results, in the notation of `Array.shape`.
             reference: "module.function" below `oasis_warp.reference` that computes the same in float64 torch.
@@ -168,7 +168,7 @@ class Operator(Declaration):
         """Declare an operator and register it.
 
         Args:
-            name: Of the operator.
+            name: Name of the operator.
             forward: From tensors and numbers to fresh tensors that alias neither the inputs nor each other. Its
                 annotations are the schema. Parameters with the names of `inputs` are those. If the last one is
                 `validate` and true, float inputs that are not finite are refused beforehand.

@@ -14,7 +14,7 @@ from oasis_warp.ops._runtime.depth_scene import Buffer, BufferParts, DepthScene,
 from oasis_warp.ops._runtime.launch import block_count, current_stream, run_cuda
 
 MAX_BLOCKS = 1 << 22
-"""Of a launch: Warp counts threads in 32 bits. Kernels loop until all is done."""
+"""Most blocks of a launch: Warp counts threads in 32 bits. Kernels loop until all is done."""
 PAIRS_PER_BLOCK = 4 * BLOCK
 """Pairs of keys that a block clears."""
 BLOCKS_AT_ONCE = 3

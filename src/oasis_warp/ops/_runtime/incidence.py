@@ -104,7 +104,7 @@ def gaussians_at_vertices(corners: Incidence, on_faces: Incidence, on_vertices: 
     The table has P + 3 Q entries: the vertices of the first P, then the corners of the faces of the others.
 
     Args:
-        corners: Of the faces, by vertex.
+        corners: Corners of the faces, by vertex.
         on_faces: The face of each of Q Gaussians.
         on_vertices: The vertex of each of P Gaussians; None for P = 0.
     """

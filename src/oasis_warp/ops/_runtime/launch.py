@@ -31,7 +31,7 @@ VECTORS = {
     torch.int32: {2: wp.vec2i, 4: wp.vec4i},
 }
 MIN_TASKS = 2048
-"""Of a generic kernel, for which another thread is worth its while."""
+"""Least tasks of a generic kernel for which another thread pays."""
 SCALAR_NAMES = {torch.float32: "float", torch.float64: "double"}
 SCALAR = {torch.float32: wp.float32, torch.float64: wp.float64, torch.int32: wp.int32, torch.int64: wp.int64}
 
@@ -322,7 +322,7 @@ def run_cuda(native: CudaNative, params: Parameters, n_blocks: int, stream: "wp.
         native: The kernel.
         params: A number or contiguous tensor for each of its parameters, none of which is an array; others are
             ignored.
-        n_blocks: Of `native.block` threads.
+        n_blocks: Number of blocks of `native.block` threads.
         stream: A `current_stream`.
     """
     if not n_blocks:

@@ -23,7 +23,7 @@ from oasis_warp.ops._runtime.kernel_cache import is_damaged, kernel_cache, remov
 from oasis_warp.ops._runtime.picture_preparation import Preparation
 
 VARIABLE = "OASIS_WARP_EXTENSION"
-"""Of the environment: 0 leaves the node aside, 1 builds it before its first use where it is not built."""
+"""Environment variable: 0 leaves the node aside, 1 builds it before its first use where it is not built."""
 NAME = "oasis_warp_picture_node"
 SOURCES = [Path(__file__).with_name(name) for name in ("picture_node.cpp", "picture_table.h")]
 IN_ORDER = "project", "count", "place", "fill", "sort", "blend"
@@ -125,7 +125,7 @@ def table_of(plan: Preparation, report: int) -> Any | None:
     """The table of a plan; None where Python's node draws: without the C++ one, and with depths or padded channels.
 
     Args:
-        plan: Of the calls.
+        plan: Plan of the calls.
         report: Address of three words of host memory that kernels write to: pairs, longest list, bad values.
     """
     extension = loaded() if plan.as_given else None

@@ -155,7 +155,7 @@ def differentiate_for_extension(
     """Gradients by the tensors of a scene that the C++ node has drawn: of a kind that is new to it, or rare.
 
     Args:
-        plan: Of the picture.
+        plan: Plan of the picture.
         looked_at: As `_Tracked.means2d`.
         needed: By tensor of the scene, whether its gradient is wanted.
         tensors: The scene.

@@ -121,7 +121,7 @@ class Preparation:
         return record, [(back, self._layout.n_tiles), *gathers]
 
     def sizes(self) -> dict[str, int]:
-        """Of pictures, workspace and lists."""
+        """Sizes of pictures, workspace and lists."""
         return {
             "n": self.n, "n_cameras": self.n_cameras, "width": self.options.width, "height": self.options.height,
             "channels": self.channels, "n_tiles": self._layout.n_tiles, "size": self._size,

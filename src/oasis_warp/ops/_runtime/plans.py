@@ -19,7 +19,7 @@ MAX_BOUNDS = 256
 MAX_PLANS = 32
 """Kinds of calls that a thread remembers."""
 ALIGNMENT = 256
-"""Of the arrays in a workspace [bytes]."""
+"""Alignment of the arrays in a workspace [bytes]."""
 
 
 class Slot(NamedTuple):
@@ -58,8 +58,8 @@ class CudaLaunch:
         """Launch `n_blocks` blocks, at least one, on the stream of this handle, which a graph may be capturing.
 
         Args:
-            n_blocks: Of `CudaNative.block` threads.
-            stream: Of CUDA.
+            n_blocks: Number of blocks of `CudaNative.block` threads.
+            stream: CUDA stream.
             *parameters: In the order of the kernel: addresses and numbers, an array as its elements.
 
         Raises:
@@ -139,7 +139,7 @@ def lay_out(sizes: Mapping[str, int], start: int = 0) -> tuple[dict[str, int], i
 
 
 def addresses(tensors: Iterable[Tensor | None]) -> list[int]:
-    """Of memory on the device; 0 for None."""
+    """Addresses of memory on the device; 0 for None."""
     return [0 if tensor is None else tensor.data_ptr() for tensor in tensors]
 
 

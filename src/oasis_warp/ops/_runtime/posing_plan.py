@@ -74,7 +74,7 @@ class GaussianInputs(NamedTuple):
     quats: Tensor
     scales: Tensor
     triangles: Tensor | None
-    """Of the rest mesh; receives no gradient."""
+    """Triangles of the rest mesh; they receive no gradient."""
 
 
 class MeshBinding(NamedTuple):

@@ -79,7 +79,7 @@ class Splats(NamedTuple):
     """Projected Gaussians of C cameras, contiguous."""
 
     records: Tensor
-    """Of the projection."""
+    """Records of the projection."""
     opacities: Tensor
     """[C, N]."""
     colors: Tensor

@@ -74,7 +74,7 @@ def transformable(
     """`run`, a custom op, as torch.func can transform it; `vmap` runs it once for each entry.
 
     Args:
-        name: Of the class.
+        name: Name of the class.
         caller: The operator that messages name.
         run: Of tensors, numbers and lists of them, to a tensor or a tuple. Of lists in that no derivative is known.
         save: The `setup_context` of a torch.autograd.Function.

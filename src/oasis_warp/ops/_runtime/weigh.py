@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from oasis_kernels.rasterize import rasterize_weights as kernels
+from oasis_kernels.rasterize import rasterize_forward as kernels
 from oasis_kernels.rasterize import strips
 from oasis_warp.ops._runtime.blend_strips import count, cut_strips
 from oasis_warp.ops._runtime.blend_tiles import (

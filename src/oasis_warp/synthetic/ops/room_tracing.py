@@ -46,7 +46,7 @@ def trace_rooms(
     Args:
         solids: float32 rows of `SOLID_WORDS` numbers in the camera's frame, laid out in `oasis_kernels.scene.rooms`;
             rows of shape 0 are empty.
-        focals: Of the camera [px], whose axis is the picture's middle.
+        focals: Focal lengths of the camera [px]; its axis is the picture's middle.
         sky: Coefficients of the light from all around.
         lamps: The lamps, with their depth buffers of the hand.
         hidden: Share of each pixel that the hand covers; covered ones are left black.

@@ -22,7 +22,7 @@ LIGHT_REACH = 3e-3
 
 
 class SurfaceState(NamedTuple):
-    """Of a batch of posed meshes."""
+    """Normals and areas of a batch of posed meshes."""
 
     normals: Float[Tensor, "B V 3"]
     """Unit, area-weighted; zero where no face is."""
@@ -48,7 +48,7 @@ class Texture(NamedTuple):
     uv: Float[Tensor, "U 2"]
     """Texels, centres at .5."""
     uv_faces: Int[Tensor, "S 3"]
-    """Of the faces of skin, which come first."""
+    """Texture corners of the faces of skin; these faces come first."""
 
 
 class Shaded(NamedTuple):
@@ -115,10 +115,10 @@ def sky_transfer(
 
     Args:
         vertices: float32 [B, V, 3] [m].
-        normals: Of `surface_state`.
+        normals: Normals of `surface_state`.
         directions: Unit vectors spread evenly over the sphere, towards the sky, [D, 3].
         viewmats: To the frame of a far camera in each direction that looks back at the mesh, [B, D, 4, 4].
-        focals: Of those cameras [px], whose axis is the middle of the buffer, [B].
+        focals: Focal lengths of those cameras [px], [B]; their axis is the middle of the buffer.
         depths: What they see, [B, D, M, M].
         lift: Distance off the surface from which vertices look [m]; as much again is allowed in depth.
         n_lit: Number of leading vertices to compute; the rows of the others are 0.
@@ -197,10 +197,10 @@ def shade_skin(
         samples: Sub-pixels along a side of a pixel.
         vertices: In the camera's frame (x right, y down, z forward) [m], float32.
         faces: As drawn in `seen`.
-        normals: Of `surface_state`.
-        transfer: Of `sky_transfer`.
+        normals: Normals of `surface_state`.
+        transfer: Transfer of `sky_transfer`.
         stretch: Area of the posed over that of the resting surface around each vertex.
-        texture: Of the skin.
+        texture: Texture of the skin.
         worn: Materials of the faces and how they look.
         tones: Mean reflectance of each image's skin, linear RGB, for light that skin throws on skin.
         texels_a_pixel: Size of a sub-pixel on the hand: relief finer than that is left out.

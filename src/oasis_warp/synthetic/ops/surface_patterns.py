@@ -123,7 +123,7 @@ def surface_dabs(
     Args:
         grid: The surface; the points of the result are in the order in which `point_grid` got them.
         centers: float32 [M, 3]; M may be 0.
-        widths: Of the profile, in the unit of the points, [M]; beyond sqrt(8) of them a dab ends.
+        widths: Widths of the profile, in the unit of the points, [M]; beyond sqrt(8) of them a dab ends.
         strengths: Values at the centres, [M]; up to 0 nothing is drawn.
         kinds: Row of the result that each dab counts for, [M].
         n_kinds: Number of rows.

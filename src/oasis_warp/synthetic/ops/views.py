@@ -42,7 +42,7 @@ class Lamps(NamedTuple):
     """Radius over distance."""
     viewmats: Float[Tensor, "B L 4 4"]
     focals: Float[Tensor, "B L"]
-    """Of the depth buffers [px], whose axis is their middle."""
+    """Focal lengths of the depth buffers [px]; their axis is the middle."""
     depths: Float[Tensor, "B L M M"]
 
     def struct(self) -> Any:
