@@ -3,6 +3,7 @@
 from oasis_warp import __version__
 
 project = "oasis_warp"
+project_copyright = "2026 the oasis_warp developers"
 version = release = __version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 html_theme = "furo"

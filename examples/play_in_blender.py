@@ -1,6 +1,7 @@
 """Render a hand from `oasis export` in a named pose with Blender.
 
-Run `pip install bpy==5.0.1`, then `python examples/play_in_blender.py hand.glb fist fist.png`; or use an installed Blender: `blender -b -P examples/play_in_blender.py -- hand.glb fist fist.png`.
+Run `pip install bpy==5.0.1`, then `python examples/play_in_blender.py hand.glb fist fist.png`; or use Blender itself:
+`blender -b -P examples/play_in_blender.py -- hand.glb fist fist.png`.
 """
 
 import sys
