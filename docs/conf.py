@@ -3,11 +3,13 @@
 from oasis_warp import __version__
 
 project = "oasis_warp"
+project_copyright = "2026 the oasis_warp developers"
 version = release = __version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 html_theme = "furo"
 html_static_path: list[str] = []
 exclude_patterns = ["_build"]
+myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"

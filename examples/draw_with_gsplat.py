@@ -1,8 +1,8 @@
-"""An avatar for programs that draw with gsplat: its Gaussians are gsplat's arguments, in gsplat's order.
+"""Draw an avatar with gsplat: `avatar.pose` returns gsplat's arguments in gsplat's order.
 
     python examples/draw_with_gsplat.py --avatar out/avatar.safetensors
 
-Draws with oasis_warp, which needs no GPU, and with gsplat where that is installed, and prints how far they are apart.
+Draws with oasis_warp, which needs no GPU, and with gsplat if it is installed, and prints the largest difference.
 """
 
 from dataclasses import dataclass

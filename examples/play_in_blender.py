@@ -1,7 +1,7 @@
-"""Draw a hand from `oasis export` in one of its poses with Blender.
+"""Render a hand from `oasis export` in a named pose with Blender.
 
-Run `python examples/play_in_blender.py hand.glb fist fist.png` where `pip install bpy==5.0.1` has been, or let Blender
-run it: `blender -b -P examples/play_in_blender.py -- hand.glb fist fist.png`.
+Run `pip install bpy==5.0.1`, then `python examples/play_in_blender.py hand.glb fist fist.png`; or use Blender itself:
+`blender -b -P examples/play_in_blender.py -- hand.glb fist fist.png`.
 """
 
 import sys

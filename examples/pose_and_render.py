@@ -1,4 +1,4 @@
-"""Pose an avatar and render it in a loop: what a program of your own does with an avatar file.
+"""Pose an avatar and render it in a loop, as your own program would.
 
     python examples/pose_and_render.py --avatar out/avatar.safetensors
     python examples/pose_and_render.py --frames 48 --size 512 --device cuda

@@ -3,7 +3,7 @@
     python examples/reconstruct.py
     python examples/reconstruct.py --photo my_hand.jpg --pose victory --out victory.png
 
-Writes a picture of the avatar in another pose, and the avatar itself beside it, and prints how well the photo is met.
+Writes a picture of the avatar in another pose and its file beside it, and prints how closely it matches the photo.
 """
 
 from dataclasses import dataclass

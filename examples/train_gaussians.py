@@ -3,8 +3,8 @@
     python examples/train_gaussians.py
     python examples/train_gaussians.py --gaussians 4000 --steps 500 --device cuda
 
-Starts from random Gaussians in front of a camera, follows the gradient of the mean squared error, prints how close the
-render comes to the picture, and writes both side by side.
+Starts from random Gaussians in front of a camera, minimises the mean squared error, prints how closely the rendering
+matches the picture, and writes both side by side.
 """
 
 import math

@@ -3,9 +3,9 @@
 Parts are patches of the surface of some millimetres, 32 a group; a word of bits says which parts of a group. One
 thread per part and image: `boxes` of its skin, and of its skin with the flesh under it; `reached`, whether it or one
 next to it meets any. One thread per group: `group_boxes`. One per part and group: `meetings`, the parts of the group
-that have skin where it has flesh, or the other way round. One thread per vertex: `normals` of what is reached; `find`, the nearest skin that the vertex
-faces in those parts; `contacts`, the same again among neighbours of the last one, and the shift that leads out of it;
-`spread`, the mean of the shifts around. Normals are those of the surface before it gives way.
+that have skin where it has flesh, or the other way round. One thread per vertex: `normals` of what is reached; `find`,
+the nearest skin that the vertex faces in those parts; `contacts`, the same again among neighbours of the last one, and
+the shift that leads out of it; `spread`, the mean of the shifts around. Normals are those of the surface before contact.
 """
 
 import warp as wp
