@@ -107,8 +107,8 @@ class Avatar:
         self._rest_mesh = vertices if vertices.requires_grad else rest_mesh(vertices, self.hand.faces, validate=False)
         self._light = None
         if light is not None:
-            known = with_photo(light, self.rest.vertices, self._photo_surface(), self.hand.faces)
-            mirrored = SurfaceLight(mirror_light(light), mirror_points(known.normals), known.seen)
+            known = with_photo(light, self.rest.vertices, self._photo_surface(), self.hand.faces, gaussians)
+            mirrored = SurfaceLight(mirror_light(light), mirror_points(known.normals), known.seen, known.end)
             self._light = mirrored if left else known
         self._fixed = *(part for part in self._canonical if part is not None), vertices, self._rest.joints
         self._source_angles = source_pose.angles.to(self.shape)

@@ -40,9 +40,11 @@ class SurfaceLight(NamedTuple):
 
     light: HandLight
     normals: Float[Tensor, "V 3"]
-    """Of the surface at rest, unit; the wrist's rim has that of its closed end."""
+    """Of the surface at rest, unit."""
     seen: Float[Tensor, "V"] | None = None
     """Share of the sky that each vertex saw in the photo; None where no shade depends on it."""
+    end: Int[Tensor, "E"] | None = None
+    """The Gaussians on the wrist's rim, which close it: light falls on them by their own normals."""
 
 
 class Lighting(NamedTuple):
@@ -57,12 +59,9 @@ class Lighting(NamedTuple):
 def posed_lighting(
     rest: Float[Tensor, "V 3"], posed: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], light: HandLight
 ) -> Lighting:
-    """The vertices of a posed surface in `light`; normals are those of the rest surface, rotated as Gaussians are.
-
-    On the rim of the wrist they are those of its end, to which Gaussians are bound: its sides would shade it in wedges.
-    """
+    """The vertices of a posed surface in `light`; normals are those of the rest surface, rotated as Gaussians are."""
     vertex_quats = face_rotations(rest, posed, faces, validate=False).vertex_quats
-    return lighting(posed, vertex_quats, surface.closed_normals(rest, faces), light)
+    return lighting(posed, vertex_quats, surface.vertex_normals(rest, faces), light)
 
 
 def lighting(
@@ -74,14 +73,23 @@ def lighting(
 
 
 def with_photo(
-    light: HandLight, rest: Float[Tensor, "V 3"], photo: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
+    light: HandLight,
+    rest: Float[Tensor, "V 3"],
+    photo: Float[Tensor, "V 3"],
+    faces: Int[Tensor, "F 3"],
+    canonical: CanonicalGaussians | None = None,
 ) -> SurfaceLight:
-    """`light` on a surface, given its vertices at rest and in the photo that the light's shade is of."""
-    normals = surface.closed_normals(rest, faces)
+    """`light` on a surface, given its vertices at rest and in the photo that the light's shade is of.
+
+    With the Gaussians, if those on the wrist's rim close it.
+    """
+    normals, end = surface.vertex_normals(rest, faces), None
+    if canonical is not None:
+        end = torch.nonzero(surface.open_vertices(faces, len(rest))[canonical.vertex_index])[:, 0]
     if light.albedo is None or light.shade is None:
-        return SurfaceLight(light, normals)
+        return SurfaceLight(light, normals, end=end)
     seen = posed_lighting(rest, photo, faces, light).exposure
-    return SurfaceLight(light, normals, None if seen is None else seen[..., 0])
+    return SurfaceLight(light, normals, None if seen is None else seen[..., 0], end)
 
 
 def hidden_by_hand(
@@ -152,6 +160,16 @@ def shading_factors(
     beyond = canonical.shade - 1
     deep = ((beyond.abs().amax(-1, keepdim=True) - WEAK) / (DEEP - WEAK)).clamp(0, 1)
     return read[..., :3] * (1 + torch.lerp(read[..., 4:], read[..., 3:4], deep) * beyond)
+
+
+def _end_factors(
+    canonical: CanonicalGaussians, quats: Float[Tensor, "*B N 4"], light: HandLight, on: Lighting, end: Int[Tensor, "E"]
+) -> Float[Tensor, "*B E 3"]:
+    """The same of vertex Gaussians by the normals of their own discs, past what is hidden of their vertices; no shade."""
+    own = quats.index_select(-2, end)
+    normals = rotation.rotate(own, own.new_tensor([0, 0, 1]).expand(*own.shape[:-1], 3))
+    seen = None if on.exposure is None else on.exposure.index_select(-2, canonical.vertex_index[end])
+    return shading(light, Lighting(normals, seen))
 
 
 def _at_gaussians(
@@ -240,5 +258,8 @@ def pose_gaussians(
     colors = canonical.colors
     if light is not None and vertex_quats is not None:
         on = lighting(posed_vertices, vertex_quats, light.normals, light.light)
-        colors = (colors * shading_factors(canonical, faces, light.light, on, light.seen)).clamp(0, 1)
+        factors = shading_factors(canonical, faces, light.light, on, light.seen)
+        if light.end is not None:
+            factors = factors.index_copy(-2, light.end, _end_factors(canonical, quats, light.light, on, light.end))
+        colors = (colors * factors).clamp(0, 1)
     return Gaussians(means, quats, scales, canonical.opacities, colors)
