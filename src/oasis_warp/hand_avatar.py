@@ -32,7 +32,7 @@ from oasis_warp.core.types import (
     Render,
     Side,
 )
-from oasis_warp.data.avatar_file import LIGHT_HIDDEN, load_avatar, save_avatar
+from oasis_warp.data.avatar_file import LIGHT_SCATTERED, load_avatar, save_avatar
 from oasis_warp.hand.contact import giving_way
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin, skin_surface
@@ -343,14 +343,14 @@ class Avatar:
             invented=tensors.get("invented"),
             hand=hand,
         )
-        return avatar._with_hidden_light() if header["version"] < LIGHT_HIDDEN else avatar
+        return avatar._with_todays_light() if header["version"] < LIGHT_SCATTERED else avatar
 
     @torch.no_grad()
-    def _with_hidden_light(self) -> "Avatar":
-        """An avatar of an older file version, whose light ignored self-occlusion; the photo's own view stays."""
+    def _with_todays_light(self) -> "Avatar":
+        """An avatar of an older file version, whose light was hidden by other rules; the photo's own view stays."""
         if self.light is None:
             return self
-        albedo = self._mean_albedo(self.light.even)
+        albedo = self._mean_albedo(self.light.even) if self.light.albedo is None else self.light.albedo
         light = hidden_by_hand(self.light, albedo, self.rest.vertices, self._photo_surface(), self.hand.faces)
         return self.with_looks(self.gaussians, light)
 

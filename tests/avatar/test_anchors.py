@@ -231,7 +231,7 @@ def test_the_cap_goes_on_from_the_skin_without_an_edge(hand, hands):
     at = rest[after.vertex_index] + after.offsets
     normals = rotation.to_matrix(after.quats[: len(at)])[:, :, 2]
     own = torch.isin(after.vertex_index, hand.rim)
-    pairs = torch.cdist(at[own], at[own]) < 0.002
+    pairs = torch.cdist(at[own], at[own]) < 0.001
     assert (normals[own] @ normals[own].T)[pairs].min() > math.cos(math.radians(50))
 
 

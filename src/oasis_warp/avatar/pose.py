@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from oasis_warp.avatar.anchors import vertex_to_gaussians
-from oasis_warp.avatar.sky import bounced, exposure, harmonic_basis, largest_nearby
+from oasis_warp.avatar.sky import arriving, bounced, exposure, harmonic_basis, largest_nearby
 from oasis_warp.core import rotation, surface
 from oasis_warp.core.types import CanonicalGaussians, Gaussians, HandLight
 from oasis_warp.ops import RestMesh, face_rotations, pose_mesh_gaussians
@@ -99,15 +99,17 @@ def hidden_by_hand(
     photo: Float[Tensor, "V 3"],
     faces: Int[Tensor, "F 3"],
 ) -> HandLight:
-    """A light that was fitted without what the hand hides of it, with that; the photo's own view stays as it is.
+    """A light of an older file with what the hand hides of it today; the photo's own view stays as it is.
 
-    There the shade makes up for what is hidden, and elsewhere it goes.
+    There the shade makes up for the difference, and elsewhere it goes. Up to version 4 nothing was hidden, `albedo` is
+    None in the light; up to version 6 nothing came through the skin.
     """
     hidden = light._replace(albedo=albedo)
     on = posed_lighting(rest, photo, faces, hidden)
     assert on.exposure is not None, "there is an albedo"
     before = 1 if light.shade is None else light.shade
-    shade = before / bounced(on.exposure[..., 1:], albedo).clamp_min(MIN_LIGHT).pow(1 / GAMMA)
+    arrived = torch.ones_like(albedo) if light.albedo is None else bounced(on.exposure[..., 1:], albedo)
+    shade = before * (arrived.clamp_min(MIN_LIGHT) / arriving(on.exposure[..., 1:], albedo)).pow(1 / GAMMA)
     return hidden._replace(shade=shade, facing=on.normals if light.facing is None else light.facing)
 
 
@@ -117,7 +119,7 @@ def shading(light: HandLight, on: Lighting) -> Float[Tensor, "*B V 3"]:
     least, most = light.limits.unbind(0)
     received = torch.minimum(torch.maximum(received, least), most)
     if on.exposure is not None and light.albedo is not None:
-        received = received * bounced(on.exposure[..., 1:], light.albedo)
+        received = received * arriving(on.exposure[..., 1:], light.albedo)
     return received.pow(1 / GAMMA)
 
 
@@ -165,9 +167,8 @@ def shading_factors(
 def _end_factors(
     canonical: CanonicalGaussians, quats: Float[Tensor, "*B N 4"], light: HandLight, on: Lighting, end: Int[Tensor, "E"]
 ) -> Float[Tensor, "*B E 3"]:
-    """The same of vertex Gaussians by the normals of their own discs, past what is hidden of their vertices; no shade."""
-    own = quats.index_select(-2, end)
-    normals = rotation.rotate(own, own.new_tensor([0, 0, 1]).expand(*own.shape[:-1], 3))
+    """The same of vertex Gaussians by the normals of their own discs, past what is hidden of their vertices."""
+    normals = rotation.to_matrix(quats.index_select(-2, end))[..., 2]
     seen = None if on.exposure is None else on.exposure.index_select(-2, canonical.vertex_index[end])
     return shading(light, Lighting(normals, seen))
 

@@ -28,7 +28,7 @@ SHADE_FADE = 0.022
 looks like a burn where the arm is missing."""
 SMOOTHING = 0.004
 """Standard deviation of the average of colours from before the fade [m]: photos show sleeves and shadows there."""
-CAP_HEIGHT = 0.01
+CAP_HEIGHT = 0.008
 """Height of the cap over the rim [m]: as much as pictures of a hand leave around it."""
 CAP_RINGS = 20
 """Steps of the cap's rings from the rim to its middle: 1.5 mm, closer than the skin's vertices."""
@@ -50,8 +50,8 @@ def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tens
     """The same hand with an end: priors let opacity fade out towards the wrist, because photos show an arm there.
 
     Gaussians in the second half of the fade are replaced by opaque ones on every vertex and face; the others become as
-    opaque as they were before the fade. The cap's Gaussians are bound to rim vertices. All go on with the colours of the
-    Gaussians before the fade, without shade; that of the others ends before.
+    opaque as they were before the fade. The cap's Gaussians are bound to rim vertices. All go on with the colours
+    before the fade, without shade; that of the others ends before.
 
     Args:
         hand: Whose surface it is.
@@ -178,23 +178,21 @@ def rim_cap(
     step = float(math.pi / 2 / CAP_RINGS)
     length = step * math.hypot(float(arms.norm(dim=1).mean()), CAP_HEIGHT) / math.sqrt(2)  # of a step, in the mean
     around = float((edge - edge.roll(1, 0)).norm(dim=1).sum())
+    fields = torch.cat([arms, outward, along], 1)
     index, offsets, normals, tangents = [], [], [], []
     for k in range(1, CAP_RINGS + 1):
         share, height = math.cos(step * k), math.sin(step * k)
         count = max(1, round(around * share / length))
         place = (torch.arange(count, device=rim.device) + 0.5 * (k % 2)) * (n / count)
-        first = place.long() % n
+        first, second = place.long() % n, (place.long() + 1) % n
         between = (place - place.floor()).to(arms)[:, None]
-
-        def on_rim(values: Tensor) -> Tensor:
-            return torch.lerp(values[first], values[(first + 1) % n], between)
-
-        rows = torch.where(between[:, 0] < 0.5, first, (first + 1) % n)
+        arm, out, tangent = torch.lerp(fields[first], fields[second], between).split(3, 1)
+        rows = torch.where(between[:, 0] < 0.5, first, second)
         index.append(rows)
-        offsets.append(center + share * on_rim(arms) + height * CAP_HEIGHT * axis - edge[rows])
-        flat = on_rim(outward).norm(dim=1, keepdim=True) * on_rim(arms).norm(dim=1, keepdim=True) * axis
-        normals.append(normalize(share * CAP_HEIGHT * on_rim(outward) + height * flat, dim=-1))
-        tangents.append(on_rim(along))
+        offsets.append(center + share * arm + height * CAP_HEIGHT * axis - edge[rows])
+        flat = out.norm(dim=1, keepdim=True) * arm.norm(dim=1, keepdim=True) * axis
+        normals.append(normalize(share * CAP_HEIGHT * out + height * flat, dim=-1))
+        tangents.append(tangent)
     spread = torch.full_like(rest[:1, 0], CAP_SPREAD * VERTEX_SPREAD * length / math.sqrt(math.pi))
     scales = torch.stack([spread, spread, THICKNESS * spread], 1).expand(len(torch.cat(index)), 3)
     return rim[torch.cat(index)], torch.cat(offsets), surface_frames(torch.cat(normals), torch.cat(tangents)), scales

@@ -5,6 +5,7 @@
 const GAMMA = 2.2; // light is sRGB to this power, nearly
 const AS_IN_PHOTO = Math.cos((5 * Math.PI) / 180), TURNED_AWAY = Math.cos((20 * Math.PI) / 180);
 const SAME_SKY = 0.08, OTHER_SKY = 0.25; // changes of the share of the sky that skin sees, as in avatar/pose.py
+const THROUGH_SKIN = [0.15, 0.07, 0.04]; // light that reaches skin which sees no sky, as in avatar/sky.py
 const WEAK = 0.3, DEEP = 0.6; // differences of shade from 1, up to which it is the skin's own, and from which it is not
 const MAP_SEEN = [0.36, 0.6, 0.57], MAP_INVENTED = [0.89, 0.55, 0.28], MAP_SKIN = 0.35; // colours of the map; share of skin in it
 
@@ -61,7 +62,7 @@ function lightPlace({ harmonics: h, limits }, bounce, x, y, z, exposure, from, o
     got = Math.min(Math.max(got, limits[c]), limits[3 + c]);
     if (bounce) {
       const e = exposure[from + 1 + c], [p, q, r] = bounce[c];
-      got *= Math.max(e, ((e * p + q) * e + r) * e); // what bounces in (Jimenez et al. 2016)
+      got *= THROUGH_SKIN[c] + (1 - THROUGH_SKIN[c]) * Math.max(e, ((e * p + q) * e + r) * e); // bounces: Jimenez et al. 2016
     }
     out[to + c] = got ** (1 / GAMMA);
   }
