@@ -138,9 +138,11 @@ def _maps() -> Float[Tensor, "C H W"]:
 
 FORM_UNIT = 0.02
 """Height of one step of the stored forms [mm]."""
-PER_MM = (0.13, 0.15, 0.16)
+PER_MM = (0.19, 0.22, 0.24)
 """What a millimetre above the skin around adds to the logarithms of sRGB. Light from one side at 45 degrees changes on
-the flank of a tendon, of slope .4, by a fifth to either side: by .09 in sRGB, and tendons stand out by .6 mm."""
+the flank of a tendon, of slope .4, by 37 % to either side: by .17 in sRGB, and tendons stand out by .6 mm. A quarter of
+the light is from all around. With it the painted back of one hand comes nearest to the photo of that hand's back, in
+the three wider bands of docs/looks.md: a1_wood_right in tests/data/photos/same_hand, 02 against 03."""
 MOST = 0.7
 """Height above the skin around to which forms are clamped [mm]."""
 BONY, TENDONS = (0.3, 0.9), (0.3, 0.9)
