@@ -235,6 +235,17 @@ def test_the_cap_goes_on_from_the_skin_without_an_edge(hand, hands):
     assert (normals[own] @ normals[own].T)[pairs].min() > math.cos(math.radians(50))
 
 
+def test_a_small_photos_hand_without_gaussians_on_faces_is_closed_too(hand, hands):
+    rest, before, after = hands
+    n = len(before.vertex_index)
+    few = before._replace(
+        face_index=before.face_index[:0], barycentrics=before.barycentrics[:0],
+        **{name: getattr(before, name)[:n] for name in ("quats", "scales", "opacities", "colors")},
+    )  # fmt: skip
+    closed = close_wrist(hand, few, rest)
+    assert int(torch.isin(closed.vertex_index, hand.rim).sum()) == int(torch.isin(after.vertex_index, hand.rim).sum())
+
+
 def test_the_rim_ends_without_teeth(hand, hands):
     """One Gaussian on each of its vertices, 2.5 mm apart, drew a saw."""
     rest, _, after = hands

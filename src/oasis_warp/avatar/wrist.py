@@ -4,6 +4,7 @@ import math
 
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -34,6 +35,8 @@ CAP_RINGS = 20
 """Steps of the cap's rings from the rim to its middle: 1.5 mm, closer than the skin's vertices."""
 MIRRORED = 0.05
 """The stretch of skin before the rim whose detail the end of the wrist repeats in the mirror [m]."""
+AVERAGED = 32
+"""Gaussians of that skin from whose mean each one's detail is what is left: 3 to 6 mm around."""
 DARKEST = 0.02
 """Colours are clamped to it before their logarithm is taken [sRGB]."""
 LOUDEST = 0.06
@@ -116,16 +119,14 @@ def _continued(
     centers = torch.cat([rest[gaussians.vertex_index] + gaussians.offsets, on_faces])
     far = torch.cdist(centers, rest[rim]).amin(1)
     skin = (fade >= 1) & (far < MIRRORED)
-
-    def smooth(at: Tensor, where: Tensor) -> Tensor:
-        near = torch.cdist(at, centers[where]).square()
-        spread = SMOOTHING**2 + near.amin(1, keepdim=True)
-        return torch.softmax(-0.5 * near / spread, 1) @ gaussians.colors[where]
-
-    mean = smooth(points, skin & (far < 2 * RIM_FADE))
+    start = skin & (far < 2 * RIM_FADE)
+    near = torch.cdist(points, centers[start]).square()
+    spread = SMOOTHING**2 + near.amin(1, keepdim=True)
+    mean = torch.softmax(-0.5 * near / spread, 1) @ gaussians.colors[start]
     axis, middle = rim_axis(rest, rim), rest[rim].mean(0)
     radius = (rest[rim] - middle).norm(dim=1).mean()
-    skin[: len(gaussians.vertex_index)] = False  # vertices lie below the faces, and have less detail
+    if len(gaussians.face_index):  # vertices lie below the faces, and have less detail
+        skin[: len(gaussians.vertex_index)] = False
 
     def unrolled(at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Directions from the axis, distance from it and place along it; skin before the fade is above 0."""
@@ -137,10 +138,16 @@ def _continued(
     (aside, out, past), (skin_aside, _, before) = unrolled(points), unrolled(centers[skin])
     past = (radius - out).clamp_min(0) - past
     keys = torch.cat([aside, past[:, None]], 1), torch.cat([skin_aside, before[:, None]], 1)
-    source = torch.nonzero(skin)[:, 0][torch.cdist(*keys).argmin(1)]
-    detail = gaussians.colors[source].clamp_min(DARKEST).log() - smooth(centers[source], skin).clamp_min(DARKEST).log()
+    source = _nearest(*keys, 1)[:, 0]
+    logs, places = gaussians.colors[skin].clamp_min(DARKEST).log(), centers[skin]
+    detail = logs[source] - logs[_nearest(places[source], places, AVERAGED)].mean(1)
     detail = detail.clamp(-LOUDEST, LOUDEST) * (2 * out / radius).clamp(max=1)[:, None]
     return (mean * detail.exp()).clamp(max=1)
+
+
+def _nearest(points: Float[Tensor, "M D"], among: Float[Tensor, "N D"], count: int) -> Int[Tensor, "M K"]:
+    found = cKDTree(among.detach().cpu().numpy()).query(points.detach().cpu().numpy(), min(count, len(among)))[1]
+    return torch.from_numpy(found.reshape(len(points), -1)).to(points.device)
 
 
 def rim_axis(rest: Float[Tensor, "V 3"], rim: Int[Tensor, "R"]) -> Float[Tensor, "3"]:
