@@ -23,8 +23,9 @@ LOBE = (1.0, 2 / 3, 1 / 4)
 THROUGH_SKIN = (0.15, 0.07, 0.04)
 """Share of the red, green and blue light that reaches skin which sees no sky, where two fingers touch. At a distance s
 from the line of contact of two cylinders of radius R the exposure is about 1.5 (s / R)^2, and light that entered there
-has travelled on below the skin: by 3.7, 1.4 and .7 mm in the model of Jensen et al. 2001. With R = 8 mm, and half of the distance in red, which reaches past small angles, that is .16, .09
-and .02; rounded by hand to a little less colour."""
+has travelled on below the skin: by 3.7, 1.4 and .7 mm in the model of Jensen et al. 2001. With R = 8 mm, and half of
+the distance in red, which reaches past small angles, that is .16, .09 and .02; rounded by hand to a little less
+colour."""
 NEARBY = 2
 """Rings of coarse faces, of 5 mm each, within which what hid the sky in the photo counts as having moved: pixels that
 may show it instead of the skin reach 5 mm past its outline (`adaptation.reliability.BEHIND_REACH`), and a fit is some
