@@ -32,7 +32,7 @@ from oasis_warp.core.types import (
     Render,
     Side,
 )
-from oasis_warp.data.avatar_file import LIGHT_HIDDEN, load_avatar, save_avatar
+from oasis_warp.data.avatar_file import LIGHT_SCATTERED, load_avatar, save_avatar
 from oasis_warp.hand.contact import resolve_contact
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin, skin_surface
@@ -107,8 +107,8 @@ class Avatar:
         self._rest_mesh = vertices if vertices.requires_grad else rest_mesh(vertices, self.hand.faces, validate=False)
         self._light = None
         if light is not None:
-            known = with_photo(light, self.rest.vertices, self._photo_surface(), self.hand.faces)
-            mirrored = SurfaceLight(mirror_light(light), mirror_points(known.normals), known.seen)
+            known = with_photo(light, self.rest.vertices, self._photo_surface(), self.hand.faces, gaussians)
+            mirrored = SurfaceLight(mirror_light(light), mirror_points(known.normals), known.seen, known.end)
             self._light = mirrored if left else known
         self._fixed = *(part for part in self._canonical if part is not None), vertices, self._rest.joints
         self._source_angles = source_pose.angles.to(self.shape)
@@ -343,14 +343,14 @@ class Avatar:
             invented=tensors.get("invented"),
             hand=hand,
         )
-        return avatar._with_hidden_light() if header["version"] < LIGHT_HIDDEN else avatar
+        return avatar._with_todays_light() if header["version"] < LIGHT_SCATTERED else avatar
 
     @torch.no_grad()
-    def _with_hidden_light(self) -> "Avatar":
-        """An avatar of an older file version: its light ignored self-occlusion. The photo's own view stays."""
+    def _with_todays_light(self) -> "Avatar":
+        """An avatar of an older file version, whose light followed other rules. The photo's own view stays."""
         if self.light is None:
             return self
-        albedo = self._mean_albedo(self.light.even)
+        albedo = self._mean_albedo(self.light.even) if self.light.albedo is None else self.light.albedo
         light = with_self_occlusion(self.light, albedo, self.rest.vertices, self._photo_surface(), self.hand.faces)
         return self.with_looks(self.gaussians, light)
 

@@ -184,7 +184,7 @@ def test_nobody_looks_into_a_hand(hand, hands):
     opened, closed = (
         render(pose_gaussians(g, hand.faces, rest, rest), camera).image[y, x] for g in (before, after)
     )
-    assert (closed - SKIN).abs().max() < 0.03
+    assert (closed - SKIN).abs().max() < 0.06
     assert (opened - SKIN).abs().max() > 0.3
 
 
@@ -195,7 +195,8 @@ def test_the_end_is_opaque_and_has_the_colour_of_the_skin_before_it(hand, hands)
         return torch.cdist(centers(hand, rest, gaussians), rest[hand.rim]).amin(1) < 0.3 * RIM_FADE
 
     assert after.opacities[end(after)].min() > 0.9 and before.opacities[end(before)].median() < 0.5
-    assert (after.colors[end(after)] - SKIN).abs().max() < 1e-4
+    apart = (after.colors[end(after)] - SKIN).abs()
+    assert apart.median() < 1e-3 and apart.max() < 0.06  # the detail of the edge to the palm comes along
 
 
 def test_the_hand_beyond_the_fade_keeps_its_bits_and_the_cap_goes_with_the_wrist(hand, hands):
@@ -211,17 +212,38 @@ def test_the_hand_beyond_the_fade_keeps_its_bits_and_the_cap_goes_with_the_wrist
     assert (moved - still).norm(dim=1).max() < 0.004  # the rim itself moves by less than that
 
 
-def test_light_falls_on_the_cap_as_on_one_end(hand, hands):
-    """It came with the rim's vertices, whose sides made a cone of dark and bright wedges."""
+def test_light_falls_on_the_cap_as_on_a_rounded_end(hand, hands):
+    """It came with the rim's vertices, whose sides made wedges; then the cap was a flat, even disk."""
     rest, _, after = hands
-    cap = after.offsets.norm(dim=1) > 2e-3
     above = torch.tensor([[1.0], [0.0], [0.8], [0.0]]).expand(4, 3)
     lamp = HandLight(above, torch.tensor([[0.1] * 3, [3.0] * 3]), torch.ones(3))
-    lit = pose_gaussians(after, hand.faces, rest, rest, with_photo(lamp, rest, rest, hand.faces)).colors
-    on_cap = (lit / after.colors)[: len(cap)][cap]
-    assert on_cap.amax() - on_cap.amin() < 1e-3
-    beside = (lit / after.colors)[: len(cap)][~cap]
-    assert beside.amax() - beside.amin() > 0.3
+    lit = pose_gaussians(after, hand.faces, rest, rest, with_photo(lamp, rest, rest, hand.faces, after)).colors
+    end = torch.nonzero(torch.isin(after.vertex_index, hand.rim))[:, 0]
+    normals = rotation.to_matrix(after.quats[end])[:, :, 2]
+    expected = (1 + 0.8 * normals[:, 1]).clamp(0.1, 3) ** (1 / 2.2)
+    factor = (lit / after.colors)[end]
+    bright = lit[end].amax(1) < 1
+    torch.testing.assert_close(factor[bright], expected[bright, None].expand(-1, 3), rtol=1e-4, atol=1e-4)
+
+
+def test_the_cap_goes_on_from_the_skin_without_an_edge(hand, hands):
+    rest, _, after = hands
+    at = rest[after.vertex_index] + after.offsets
+    normals = rotation.to_matrix(after.quats[: len(at)])[:, :, 2]
+    own = torch.isin(after.vertex_index, hand.rim)
+    pairs = torch.cdist(at[own], at[own]) < 0.001
+    assert (normals[own] @ normals[own].T)[pairs].min() > math.cos(math.radians(50))
+
+
+def test_a_small_photos_hand_without_gaussians_on_faces_is_closed_too(hand, hands):
+    rest, before, after = hands
+    n = len(before.vertex_index)
+    few = before._replace(
+        face_index=before.face_index[:0], barycentrics=before.barycentrics[:0],
+        **{name: getattr(before, name)[:n] for name in ("quats", "scales", "opacities", "colors")},
+    )  # fmt: skip
+    closed = close_wrist(hand, few, rest)
+    assert int(torch.isin(closed.vertex_index, hand.rim).sum()) == int(torch.isin(after.vertex_index, hand.rim).sum())
 
 
 def test_the_rim_ends_without_teeth(hand, hands):

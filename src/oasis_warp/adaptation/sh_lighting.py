@@ -17,7 +17,7 @@ from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.avatar.anchors import rim_fade, vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.observation import Observation, observe
 from oasis_warp.avatar.pose import GAMMA, Lighting, posed_lighting, shading
-from oasis_warp.avatar.sky import bounced, harmonic_basis
+from oasis_warp.avatar.sky import arriving, harmonic_basis
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandLight
@@ -147,7 +147,7 @@ def _even_light(albedo: Float[Tensor, "3"]) -> HandLight:
 
 def _arriving(light: HandLight, on: Lighting) -> Float[Tensor, "V 3"]:
     assert on.exposure is not None and light.albedo is not None, "this light is hidden by the hand"
-    return bounced(on.exposure[..., 1:], light.albedo)
+    return arriving(on.exposure[..., 1:], light.albedo)
 
 
 def _solve_harmonics(

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from oasis_warp.avatar.anchors import vertex_to_gaussians
-from oasis_warp.avatar.sky import bounced, exposure, harmonic_basis, largest_nearby
+from oasis_warp.avatar.sky import arriving, bounced, exposure, harmonic_basis, largest_nearby
 from oasis_warp.core import rotation, surface
 from oasis_warp.core.types import CanonicalGaussians, Gaussians, HandLight
 from oasis_warp.ops import RestMesh, face_rotations, pose_mesh_gaussians
@@ -40,9 +40,11 @@ class SurfaceLight(NamedTuple):
 
     light: HandLight
     normals: Float[Tensor, "V 3"]
-    """Unit normals of the surface at rest; the wrist's rim has the normal of its closed end."""
+    """Unit normals of the surface at rest."""
     seen: Float[Tensor, "V"] | None = None
     """Share of the sky that each vertex saw in the photo; None where no shade depends on it."""
+    end: Int[Tensor, "E"] | None = None
+    """The Gaussians on the wrist's rim, which close it: light falls on them by their own normals."""
 
 
 class Lighting(NamedTuple):
@@ -57,13 +59,9 @@ class Lighting(NamedTuple):
 def posed_lighting(
     rest: Float[Tensor, "V 3"], posed: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], light: HandLight
 ) -> Lighting:
-    """`Lighting` of a posed surface in `light`; its normals are those at rest, rotated as Gaussians are.
-
-    On the rim of the wrist the normals are those of the wrist's end, to which Gaussians are bound. The normals of its
-    sides would shade it in wedges.
-    """
+    """`Lighting` of a posed surface in `light`; its normals are those at rest, rotated as Gaussians are."""
     vertex_quats = face_rotations(rest, posed, faces, validate=False).vertex_quats
-    return lighting(posed, vertex_quats, surface.closed_normals(rest, faces), light)
+    return lighting(posed, vertex_quats, surface.vertex_normals(rest, faces), light)
 
 
 def lighting(
@@ -75,14 +73,23 @@ def lighting(
 
 
 def with_photo(
-    light: HandLight, rest: Float[Tensor, "V 3"], photo: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
+    light: HandLight,
+    rest: Float[Tensor, "V 3"],
+    photo: Float[Tensor, "V 3"],
+    faces: Int[Tensor, "F 3"],
+    canonical: CanonicalGaussians | None = None,
 ) -> SurfaceLight:
-    """`light` on a surface, given its vertices at rest and in the photo that the light's shade is of."""
-    normals = surface.closed_normals(rest, faces)
+    """`light` on a surface, given its vertices at rest and in the photo that the light's shade is of.
+
+    With the Gaussians, if those on the wrist's rim close it.
+    """
+    normals, end = surface.vertex_normals(rest, faces), None
+    if canonical is not None:
+        end = torch.nonzero(surface.open_vertices(faces, len(rest))[canonical.vertex_index])[:, 0]
     if light.albedo is None or light.shade is None:
-        return SurfaceLight(light, normals)
+        return SurfaceLight(light, normals, end=end)
     seen = posed_lighting(rest, photo, faces, light).exposure
-    return SurfaceLight(light, normals, None if seen is None else seen[..., 0])
+    return SurfaceLight(light, normals, None if seen is None else seen[..., 0], end)
 
 
 def with_self_occlusion(
@@ -92,15 +99,17 @@ def with_self_occlusion(
     photo: Float[Tensor, "V 3"],
     faces: Int[Tensor, "F 3"],
 ) -> HandLight:
-    """Add to a light what the hand hides of it, for a light that was fitted without.
+    """Convert the light of an older file to today's rules of what the hand hides and of light through the skin.
 
-    The photo's own view stays as it is: there the shade makes up for what is hidden. Elsewhere the shade goes.
+    The photo's own view stays as it is: there the shade makes up for the difference. Elsewhere the shade goes. Up to
+    version 4 nothing was hidden, and `albedo` is None; up to version 6 no light came through the skin.
     """
     hidden = light._replace(albedo=albedo)
     on = posed_lighting(rest, photo, faces, hidden)
     assert on.exposure is not None, "there is an albedo"
     before = 1 if light.shade is None else light.shade
-    shade = before / bounced(on.exposure[..., 1:], albedo).clamp_min(MIN_LIGHT).pow(1 / GAMMA)
+    arrived = torch.ones_like(albedo) if light.albedo is None else bounced(on.exposure[..., 1:], albedo)
+    shade = before * (arrived.clamp_min(MIN_LIGHT) / arriving(on.exposure[..., 1:], albedo)).pow(1 / GAMMA)
     return hidden._replace(shade=shade, facing=on.normals if light.facing is None else light.facing)
 
 
@@ -110,7 +119,7 @@ def shading(light: HandLight, on: Lighting) -> Float[Tensor, "*B V 3"]:
     least, most = light.limits.unbind(0)
     received = torch.minimum(torch.maximum(received, least), most)
     if on.exposure is not None and light.albedo is not None:
-        received = received * bounced(on.exposure[..., 1:], light.albedo)
+        received = received * arriving(on.exposure[..., 1:], light.albedo)
     return received.pow(1 / GAMMA)
 
 
@@ -153,6 +162,15 @@ def shading_factors(
     beyond = canonical.shade - 1
     deep = ((beyond.abs().amax(-1, keepdim=True) - WEAK) / (DEEP - WEAK)).clamp(0, 1)
     return read[..., :3] * (1 + torch.lerp(read[..., 4:], read[..., 3:4], deep) * beyond)
+
+
+def _end_factors(
+    canonical: CanonicalGaussians, quats: Float[Tensor, "*B N 4"], light: HandLight, on: Lighting, end: Int[Tensor, "E"]
+) -> Float[Tensor, "*B E 3"]:
+    """The same of vertex Gaussians by the normals of their own discs, past what is hidden of their vertices."""
+    normals = rotation.to_matrix(quats.index_select(-2, end))[..., 2]
+    seen = None if on.exposure is None else on.exposure.index_select(-2, canonical.vertex_index[end])
+    return shading(light, Lighting(normals, seen))
 
 
 def _at_gaussians(
@@ -241,5 +259,8 @@ def pose_gaussians(
     colors = canonical.colors
     if light is not None and vertex_quats is not None:
         on = lighting(posed_vertices, vertex_quats, light.normals, light.light)
-        colors = (colors * shading_factors(canonical, faces, light.light, on, light.seen)).clamp(0, 1)
+        factors = shading_factors(canonical, faces, light.light, on, light.seen)
+        if light.end is not None:
+            factors = factors.index_copy(-2, light.end, _end_factors(canonical, quats, light.light, on, light.end))
+        colors = (colors * factors).clamp(0, 1)
     return Gaussians(means, quats, scales, canonical.opacities, colors)

@@ -4,6 +4,7 @@ import math
 
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -28,12 +29,18 @@ SHADE_FADE = 0.022
 looks like a burn where the arm is missing."""
 SMOOTHING = 0.004
 """Standard deviation of the average of colours from before the fade [m]: photos show sleeves and shadows there."""
-CAP_HEIGHT = 0.006
-"""Height of the cap over the rim [m]."""
-CAP_RINGS = 12
-"""Steps of the cap's rings from the rim to its middle: about as far apart as the rim's vertices."""
-INDENT = 0.003
-"""How far the cap's widest Gaussians stay inside the rim, where they would make a collar [m]."""
+CAP_HEIGHT = 0.008
+"""Height of the cap over the rim [m]: as much as pictures of a hand leave around it."""
+CAP_RINGS = 20
+"""Steps of the cap's rings from the rim to its middle: 1.5 mm, closer than the skin's vertices."""
+MIRRORED = 0.05
+"""The stretch of skin before the rim whose detail the end of the wrist repeats in the mirror [m]."""
+AVERAGED = 32
+"""Gaussians of that skin from whose mean each one's detail is what is left: 3 to 6 mm around."""
+DARKEST = 0.02
+"""Colours are clamped to it before their logarithm is taken [sRGB]."""
+LOUDEST = 0.06
+"""Largest logarithm of that detail, three times what the finest of real backs has: more is a shadow or a sleeve."""
 RIM_PARTS = -1 / 3, 0.0, 1 / 3
 """Places of Gaussians along the edges at a vertex of the rim, as shares of the edge: one on each vertex makes teeth."""
 RIM_SPREAD = 0.8
@@ -46,8 +53,8 @@ def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tens
     """Close the hand at the wrist, where a prior's opacity fades out because photos show an arm there.
 
     Gaussians in the second half of the fade are replaced by opaque ones on every vertex and face; the others become as
-    opaque as they were before the fade. The cap's Gaussians are bound to rim vertices. New Gaussians have the colours
-    of the nearest Gaussians before the fade, and no shade; the shade of the others ends before.
+    opaque as they were before the fade. The cap's Gaussians are bound to rim vertices. New Gaussians continue the
+    colours of those before the fade, without shade; the shade of the others ends before.
 
     Args:
         hand: Model of the surface.
@@ -67,7 +74,8 @@ def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tens
     index, offsets, end_quats, end_scales = (torch.cat(parts) for parts in zip(*end, strict=True))
     scales = full.scales[0]
     points = torch.cat([rest[vertices], rest[index] + offsets])
-    read = [_smoothed(gaussians, own, rest, faces, rim, at) for at in (points, rest[faces[on_faces]].mean(1))]
+    read = _continued(gaussians, own, rest, faces, rim, torch.cat([points, rest[faces[on_faces]].mean(1)]))
+    read = read.split([len(points), len(on_faces)])
 
     def joined(old: Tensor, of_points: Tensor, of_faces: Tensor) -> Tensor:
         return torch.cat([old[:n_kept], of_points, old[n_kept:], of_faces])
@@ -98,20 +106,55 @@ def _shade_left(hand: HandModel, rest: Tensor) -> Float[Tensor, "V 1"]:
     return rim_fade(rest[None], hand.rim.to(rest.device), RIM_FADE, SHADE_FADE)[0, :, None]
 
 
-def _smoothed(
+def _continued(
     gaussians: CanonicalGaussians, fade: Tensor, rest: Tensor, faces: Tensor, rim: Tensor, points: Tensor
 ) -> Float[Tensor, "M 3"]:
-    """The colours of Gaussians just before the fade, averaged around `points`.
+    """Colours at `points` past where the fade begins: smooth ones from just before it, with detail of skin.
 
-    The average is wider where these are farther away. With one width the middle of the cap would have wedges of one
-    colour each.
+    They are averages, and wider where the skin is farther away. With one width the middle of the cap would have wedges
+    of one colour each. Detail is the difference of the skin as far before that place, in the same direction from the
+    wrist's axis, from its own averages; towards the middle of the cap, where all directions meet, it ends.
     """
     on_faces = (rest[faces[gaussians.face_index]] * gaussians.barycentrics[..., None]).sum(1)
     centers = torch.cat([rest[gaussians.vertex_index] + gaussians.offsets, on_faces])
-    before = (fade >= 1) & (torch.cdist(centers, rest[rim]).amin(1) < 2 * RIM_FADE)
-    near = torch.cdist(points, centers[before]).square()
+    far = torch.cdist(centers, rest[rim]).amin(1)
+    skin = (fade >= 1) & (far < MIRRORED)
+    start = skin & (far < 2 * RIM_FADE)
+    near = torch.cdist(points, centers[start]).square()
     spread = SMOOTHING**2 + near.amin(1, keepdim=True)
-    return torch.softmax(-0.5 * near / spread, 1) @ gaussians.colors[before]
+    mean = torch.softmax(-0.5 * near / spread, 1) @ gaussians.colors[start]
+    axis, middle = rim_axis(rest, rim), rest[rim].mean(0)
+    radius = (rest[rim] - middle).norm(dim=1).mean()
+    if len(gaussians.face_index):  # vertices lie below the faces, and have less detail
+        skin[: len(gaussians.vertex_index)] = False
+
+    def unrolled(at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Directions from the axis, distance from it and place along it; skin before the fade is above 0."""
+        arm = at - middle
+        along = arm @ axis
+        arm = arm - along[:, None] * axis
+        return radius * normalize(arm, dim=1), arm.norm(dim=1), -along - RIM_FADE
+
+    (aside, out, past), (skin_aside, _, before) = unrolled(points), unrolled(centers[skin])
+    past = (radius - out).clamp_min(0) - past
+    keys = torch.cat([aside, past[:, None]], 1), torch.cat([skin_aside, before[:, None]], 1)
+    source = _nearest(*keys, 1)[:, 0]
+    logs, places = gaussians.colors[skin].clamp_min(DARKEST).log(), centers[skin]
+    detail = logs[source] - logs[_nearest(places[source], places, AVERAGED)].mean(1)
+    detail = detail.clamp(-LOUDEST, LOUDEST) * (2 * out / radius).clamp(max=1)[:, None]
+    return (mean * detail.exp()).clamp(max=1)
+
+
+def _nearest(points: Float[Tensor, "M D"], among: Float[Tensor, "N D"], count: int) -> Int[Tensor, "M K"]:
+    found = cKDTree(among.detach().cpu().numpy()).query(points.detach().cpu().numpy(), min(count, len(among)))[1]
+    return torch.from_numpy(found.reshape(len(points), -1)).to(points.device)
+
+
+def rim_axis(rest: Float[Tensor, "V 3"], rim: Int[Tensor, "R"]) -> Float[Tensor, "3"]:
+    """The direction in which the arm would go on: the normal of the rim, away from the hand."""
+    arms, middle = rest[rim] - rest[rim].mean(0), rest[rim].mean(0)
+    axis = normalize(torch.linalg.cross(arms, arms.roll(-1, 0)).sum(0), dim=0)
+    return axis * torch.sign((axis * (middle - rest.mean(0))).sum())
 
 
 def rim_line(
@@ -131,29 +174,35 @@ def rim_cap(
 ) -> tuple[Int[Tensor, "M"], Float[Tensor, "M 3"], Float[Tensor, "M 4"], Float[Tensor, "M 3"]]:
     """Vertex Gaussians that close the open end: vertices of the rim, offsets, quaternions and scales [m].
 
-    Ring k of n has the radius r = 1 - k / n of the rim's and the height 1 - r^2 of the cap's: a paraboloid.
+    With arms a from the middle of the rim to its points, p = cos(f) a + sin(f) h: half an ellipsoid, which goes on from
+    the skin without an edge. Rings of equal steps of f have points as far apart as they are from each other.
     """
     edge, center, n = rest[rim], rest[rim].mean(0), len(rim)
-    arms = edge - center
-    axis = normalize(torch.linalg.cross(arms, arms.roll(-1, 0)).sum(0), dim=0)
-    axis = axis * torch.sign((axis * (center - rest.mean(0))).sum())  # away from the hand
-    radius, circumference = arms.norm(dim=1).mean(), (edge - edge.roll(1, 0)).norm(dim=1).sum()
-    arms = arms * (1 - INDENT / radius)
-    index, offsets, normals, along, spreads = [], [], [], [], []
-    for k in range(CAP_RINGS + 1):
-        share = 1 - k / CAP_RINGS
-        count = max(4, math.ceil(n * share))
-        rows = torch.arange(count, device=rim.device) * n // count
+    arms, axis = edge - center, rim_axis(rest, rim)
+    along = arms.roll(-1, 0) - arms.roll(1, 0)
+    outward = torch.linalg.cross(along, axis.expand_as(along))
+    outward = outward * torch.sign((outward * arms).sum())
+    step = float(math.pi / 2 / CAP_RINGS)
+    length = step * math.hypot(float(arms.norm(dim=1).mean()), CAP_HEIGHT) / math.sqrt(2)  # of a step, in the mean
+    around = float((edge - edge.roll(1, 0)).norm(dim=1).sum())
+    fields = torch.cat([arms, outward, along], 1)
+    index, offsets, normals, tangents = [], [], [], []
+    for k in range(1, CAP_RINGS + 1):
+        share, height = math.cos(step * k), math.sin(step * k)
+        count = max(1, round(around * share / length))
+        place = (torch.arange(count, device=rim.device) + 0.5 * (k % 2)) * (n / count)
+        first, second = place.long() % n, (place.long() + 1) % n
+        between = (place - place.floor()).to(arms)[:, None]
+        arm, out, tangent = torch.lerp(fields[first], fields[second], between).split(3, 1)
+        rows = torch.where(between[:, 0] < 0.5, first, second)
         index.append(rows)
-        at = center + share * arms[rows] + CAP_HEIGHT * (1 - share * share) * axis
-        offsets.append(at - edge[rows])
-        normals.append(normalize(axis + 2 * share * CAP_HEIGHT / radius**2 * arms[rows], dim=-1))
-        along.append(arms[rows])
-        area = radius / CAP_RINGS * circumference * max(share, 0.5 / CAP_RINGS) / count
-        spreads.append((CAP_SPREAD * VERTEX_SPREAD * (area / math.pi).sqrt()).expand(count))
-    spread = torch.cat(spreads)
-    quats = surface_frames(torch.cat(normals), torch.cat(along))
-    return rim[torch.cat(index)], torch.cat(offsets), quats, torch.stack([spread, spread, THICKNESS * spread], 1)
+        offsets.append(center + share * arm + height * CAP_HEIGHT * axis - edge[rows])
+        flat = out.norm(dim=1, keepdim=True) * arm.norm(dim=1, keepdim=True) * axis
+        normals.append(normalize(share * CAP_HEIGHT * out + height * flat, dim=-1))
+        tangents.append(tangent)
+    spread = torch.full_like(rest[:1, 0], CAP_SPREAD * VERTEX_SPREAD * length / math.sqrt(math.pi))
+    scales = torch.stack([spread, spread, THICKNESS * spread], 1).expand(len(torch.cat(index)), 3)
+    return rim[torch.cat(index)], torch.cat(offsets), surface_frames(torch.cat(normals), torch.cat(tangents)), scales
 
 
 def select(gaussians: CanonicalGaussians, kept: Bool[Tensor, "N"]) -> CanonicalGaussians:

@@ -31,15 +31,6 @@ def vertex_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) ->
     return normalize(scatter_to_vertices(normals * areas[:, None], faces, len(vertices)), dim=-1, eps=1e-30)
 
 
-def closed_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "V 3"]:
-    """`vertex_normals` of a surface with one opening, as if a flat lid closed it; the rim has the lid's normal.
-
-    The area vectors of a closed surface add up to 0, so the lid's is minus the sum of the others.
-    """
-    lid = normalize(-face_crosses(vertices, faces).sum(0), dim=0, eps=1e-30)
-    return torch.where(open_vertices(faces, len(vertices))[:, None], lid, vertex_normals(vertices, faces))
-
-
 def open_vertices(faces: Int[Tensor, "F 3"], n_vertices: int) -> Bool[Tensor, "V"]:
     """Whether the faces around each vertex leave a gap; in a closed ring every neighbour is entered and left once."""
     come_less_gone = (faces.roll(-1, 1) - faces.roll(1, 1)).flatten().long()

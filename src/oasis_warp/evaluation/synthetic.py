@@ -254,7 +254,7 @@ def draw_targets(
             posed_gaussians = pose_gaussians(made.without_light(), hand.faces, rest, posed)
         else:
             light = rotate_light(made.light, rotations[k].to(rest))
-            light = with_photo(light, rest, batch.posed[0], hand.faces)
+            light = with_photo(light, rest, batch.posed[0], hand.faces, made.gaussians)
             posed_gaussians = pose_gaussians(made.gaussians, hand.faces, rest, posed, light)
         images.append(render(posed_gaussians, Camera(viewmat, K, size, size)).image)
     return images

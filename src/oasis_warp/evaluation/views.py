@@ -38,7 +38,7 @@ JUMP = 0.005
 
 WRIST_REACH = 0.015
 """Distance from the wrist's opening within which a hand ends [m]: opacity fades over 8 mm before it, and the skin
-is rounded over 6 mm past it."""
+is rounded over 8 mm past it."""
 
 Kind = Literal["input", "side", "pose", "back"]
 

@@ -201,7 +201,7 @@ def _middle(vertices: Float[Tensor, "N 3"]) -> Float[Tensor, "3"]:
 @torch.no_grad()
 def _arrays(avatar: Avatar, light: SurfaceLight) -> dict[str, np.ndarray | Packed]:
     hand, rest, gaussians, own_light = avatar.parts
-    normals = surface.closed_normals(avatar.rest.vertices, avatar.hand.faces)
+    normals = surface.vertex_normals(avatar.rest.vertices, avatar.hand.faces)
     sky, mesh = sky_directions(torch.device("cpu")), sky_mesh(torch.device("cpu"))
     even = torch.ones(3) if own_light is None else own_light.light.even.cpu() ** (1 / GAMMA)
     correctives = hand.corrective_basis.permute(2, 0, 1)
@@ -214,6 +214,7 @@ def _arrays(avatar: Avatar, light: SurfaceLight) -> dict[str, np.ndarray | Packe
         "weights": _weights(hand.weights),
         "correctives": _pack(correctives / reach.clamp_min(1e-9)[:, None, None], kind, np.iinfo(kind).max / steps),
         "reach": _numpy(reach, "f4"),
+        "rim": _numpy(hand.rim, "u2"),
         "joints": _numpy(rest.joints, "f4"),
         "axes": _numpy(hand.pose_axes, "f4"),
         "normals": _pack(mirror_points(normals) if avatar.side == "left" else normals, "i2", 1.0),

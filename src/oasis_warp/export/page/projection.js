@@ -76,13 +76,14 @@ function projectGaussians(gaussians, projection, camera) {
 
 // Which vertices carry Gaussians that are drawn: all, or those whose skin faces the eye, or nearly. The
 // others lie behind; they fill what little the front lets through.
-function markShown({ posed, nVertices }, { shown }, normals, [ex, ey, ez], facing) {
+function markShown({ posed, nVertices, data }, { shown }, normals, [ex, ey, ez], facing) {
   if (!facing) return shown.fill(1);
   for (let v = 0; v < nVertices; v++) {
     const x = ex - posed[3 * v], y = ey - posed[3 * v + 1], z = ez - posed[3 * v + 2];
     const along = x * normals[3 * v] + y * normals[3 * v + 1] + z * normals[3 * v + 2];
     shown[v] = along > FACES_AWAY * Math.sqrt(x * x + y * y + z * z) ? 1 : 0;
   }
+  for (const v of data.arrays.rim) shown[v] = 1; // the cap over the wrist faces elsewhere
 }
 
 // The ellipses in the order in which they are drawn, the farthest first, packed for the graphics card.

@@ -5,14 +5,24 @@
 const GAMMA = 2.2; // light is sRGB to this power, nearly
 const AS_IN_PHOTO = Math.cos((5 * Math.PI) / 180), TURNED_AWAY = Math.cos((20 * Math.PI) / 180);
 const SAME_SKY = 0.08, OTHER_SKY = 0.25; // changes of the share of the sky that skin sees, as in avatar/pose.py
+const THROUGH_SKIN = [0.15, 0.07, 0.04]; // light that reaches skin which sees no sky, as in avatar/sky.py
 const WEAK = 0.3, DEEP = 0.6; // differences of shade from 1, up to which it is the skin's own, and from which it is not
 const MAP_SEEN = [0.36, 0.6, 0.57], MAP_INVENTED = [0.89, 0.55, 0.28], MAP_SKIN = 0.35; // colours of the map; share of skin in it
 
 function makeShading(body, gaussians) {
+  const { rim, quats } = body.data.arrays, onRim = new Set(rim), { corners, nOnVertices, count } = gaussians;
+  const lit = corners.slice(), ends = []; // lit: whose factors each Gaussian has; those that close the wrist have their own
+  for (let i = 0; i < nOnVertices; i++) {
+    if (!onRim.has(corners[3 * i])) continue;
+    const m = rotationMatrix(quats, 4 * i);
+    lit.fill(body.nVertices + ends.length, 3 * i, 3 * i + 3);
+    ends.push({ vertex: corners[3 * i], normal: [m[2], m[5], m[8]] });
+  }
+  const size = body.nVertices + ends.length;
   return {
-    normals: new Float32Array(3 * body.nVertices), factors: new Float32Array(4 * body.nVertices),
-    change: new Float32Array(body.nVertices), nearby: new Float32Array(body.nVertices), deep: new Float32Array(body.nVertices),
-    colors: new Uint32Array(gaussians.count), sky: makeSky(body),
+    normals: new Float32Array(3 * body.nVertices), factors: new Float32Array(4 * size), lit, ends,
+    change: new Float32Array(body.nVertices), nearby: new Float32Array(body.nVertices), deep: new Float32Array(size),
+    colors: new Uint32Array(count), sky: makeSky(body),
   };
 }
 
@@ -21,7 +31,7 @@ const between = (x, low, high) => Math.min(Math.max((x - low) / (high - low), 0)
 // Factors of the colours of every vertex and the share of the photo's weak shade that is left, into shading.factors; that
 // of deep shade into shading.deep: for it, and where the photo is in doubt, the change of the sky is the largest nearby.
 function lightVertices(body, shading, light, hurry = false) {
-  const { shade, facing, doubt } = body.data.arrays, { normals, factors, sky, change, nearby, deep } = shading, { harmonics, limits, albedo, seen } = light;
+  const { shade, facing, doubt } = body.data.arrays, { normals, factors, sky, change, nearby, deep, ends } = shading, { harmonics, albedo, seen } = light;
   if (albedo) exposeVertices(body, sky, normals, harmonics, hurry);
   if (albedo && seen) {
     for (let v = 0; v < body.nVertices; v++) change[v] = Math.max(sky.exposure[4 * v] - seen[v], 0); // what cast the shade has moved
@@ -29,41 +39,49 @@ function lightVertices(body, shading, light, hurry = false) {
   }
   const bounce = albedo && albedo.map((a) => [2.0404 * a - 0.3324, -4.7951 * a + 0.6417, 2.7552 * a + 0.6903]);
   for (let v = 0; v < body.nVertices; v++) {
-    const x = normals[3 * v], y = normals[3 * v + 1], z = normals[3 * v + 2], exposure = sky.exposure;
+    const x = normals[3 * v], y = normals[3 * v + 1], z = normals[3 * v + 2];
     const kept = facing ? between(x * facing[3 * v] + y * facing[3 * v + 1] + z * facing[3 * v + 2], TURNED_AWAY, AS_IN_PHOTO) : 0;
     const left = (moved) => (albedo && seen ? kept * (1 - between(moved, SAME_SKY, OTHER_SKY)) : kept);
     deep[v] = left(nearby[v]);
-    const xy = x * y, yz = y * z, zz = 3 * z * z - 1, xz = x * z, xx = x * x - y * y;
-    for (let c = 0; c < 3; c++) {
-      const h = harmonics;
-      let got = h[c] + h[3 + c] * x + h[6 + c] * y + h[9 + c] * z + h[12 + c] * xy + h[15 + c] * yz + h[18 + c] * zz +
-        h[21 + c] * xz + h[24 + c] * xx;
-      got = Math.min(Math.max(got, limits[c]), limits[3 + c]);
-      if (albedo) {
-        const e = exposure[4 * v + 1 + c], [p, q, r] = bounce[c];
-        got *= Math.max(e, ((e * p + q) * e + r) * e); // what bounces in (Jimenez et al. 2016)
-      }
-      const factor = got ** (1 / GAMMA);
-      factors[4 * v + c] = shade ? factor * (1 + deep[v] * (shade[3 * v + c] - 1)) : factor;
-    }
+    lightPlace(light, bounce, x, y, z, sky.exposure, 4 * v, factors, 4 * v);
+    if (shade) for (let c = 0; c < 3; c++) factors[4 * v + c] *= 1 + deep[v] * (shade[3 * v + c] - 1);
     factors[4 * v + 3] = left(doubt ? change[v] + doubt[v] * (nearby[v] - change[v]) : change[v]);
+  }
+  ends.forEach(({ vertex, normal }, k) => {
+    const [x, y, z] = turned(rotationMatrix(body.quats, 4 * vertex), normal);
+    lightPlace(light, bounce, x, y, z, sky.exposure, 4 * vertex, factors, 4 * (body.nVertices + k));
+  });
+}
+
+// Factors of colours that face (x, y, z), past what is hidden of the light there.
+function lightPlace({ harmonics: h, limits }, bounce, x, y, z, exposure, from, out, to) {
+  const xy = x * y, yz = y * z, zz = 3 * z * z - 1, xz = x * z, xx = x * x - y * y;
+  for (let c = 0; c < 3; c++) {
+    let got = h[c] + h[3 + c] * x + h[6 + c] * y + h[9 + c] * z + h[12 + c] * xy + h[15 + c] * yz + h[18 + c] * zz +
+      h[21 + c] * xz + h[24 + c] * xx;
+    got = Math.min(Math.max(got, limits[c]), limits[3 + c]);
+    if (bounce) {
+      const e = exposure[from + 1 + c], [p, q, r] = bounce[c];
+      got *= THROUGH_SKIN[c] + (1 - THROUGH_SKIN[c]) * Math.max(e, ((e * p + q) * e + r) * e); // bounces: Jimenez et al. 2016
+    }
+    out[to + c] = got ** (1 / GAMMA);
   }
 }
 
 // Colours and opacities of all Gaussians, a byte each, into shading.colors. `light` is null for even light.
 function colorGaussians(body, gaussians, shading, light) {
-  const { colors: own, fineShade, even } = body.data.arrays, { count, corners, shares, heaviest, shown, opacities } = gaussians;
-  const { factors, colors, deep } = shading;
+  const { colors: own, fineShade, even } = body.data.arrays, { count, shares, heaviest, shown, opacities } = gaussians;
+  const { factors, colors, deep, lit } = shading;
   for (let i = 0; i < count; i++) {
     if (!shown[heaviest[i]]) continue;
     const a = 3 * i, p = shares[a], q = shares[a + 1], r = shares[a + 2];
-    const u = 4 * corners[a], v = 4 * corners[a + 1], w = 4 * corners[a + 2];
+    const u = 4 * lit[a], v = 4 * lit[a + 1], w = 4 * lit[a + 2];
     let stays = 0;
     if (light && fineShade) {
       const red = Math.abs(fineShade[a] - 1), green = Math.abs(fineShade[a + 1] - 1), blue = Math.abs(fineShade[a + 2] - 1);
       const share = between(Math.max(red, green, blue), WEAK, DEEP);
       stays = (1 - share) * (p * factors[u + 3] + q * factors[v + 3] + r * factors[w + 3]) +
-        share * (p * deep[corners[a]] + q * deep[corners[a + 1]] + r * deep[corners[a + 2]]);
+        share * (p * deep[lit[a]] + q * deep[lit[a + 1]] + r * deep[lit[a + 2]]);
     }
     let packed = Math.round(255 * opacities[i]) << 24;
     for (let c = 0; c < 3; c++) {
