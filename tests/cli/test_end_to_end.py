@@ -273,6 +273,7 @@ def test_full_memory_is_told_in_one_sentence(avatar_file, tmp_path, monkeypatch,
     [
         (RuntimeError("blend: CUDA error 719: unspecified launch failure"), "cpu failed in the middle of the work"),
         (OSError(24, "Too many open files"), "too many files are open"),
+        (OSError(36, "File name too long"), "the name of a file is too long"),
         (OSError(28, "No space left on device"), "a disk is full"),
     ],
 )

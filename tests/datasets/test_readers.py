@@ -154,6 +154,7 @@ DAMAGE = {
     "other photo": ("interhand", _annotation(lambda v: v.update(image_id=999)), "names a photo that is not listed"),
     "no capture": ("interhand", _image(lambda v: v.pop("capture")), "the annotation 'capture' is missing"),
     "capture in words": ("interhand", _image(lambda v: v.update(capture="zero")), "a damaged annotation"),
+    "a long name": ("interhand", _image(lambda v: v.update(file_name="x" * 300)), "the photo x+ is missing"),
     "no frame number": ("interhand", _image(lambda v: v.pop("frame_idx")), "the annotation 'frame_idx' is missing"),
     "no calibration": ("hanco", lambda r: (r / "calib/0003/00000000.json").unlink(), "calib.* cannot be read"),
     "calibration cut": ("hanco", _json("calib/0003/00000000.json", lambda v: v["M"].pop(7)), "camera 7"),

@@ -48,6 +48,7 @@ SHORTAGES = {
     ),
     "too many files are open; allow this process more of them (`ulimit -n 1024`).": ("Too many open files",),
     "a disk is full; free some room on it, also where temporary files lie.": ("No space left on device",),
+    "the name of a file is too long for this disk; choose a shorter one.": ("File name too long",),
     "{device} failed in the middle of the work, nothing written; see what `oasis doctor` says.": ("CUDA error",),
 }  # fmt: skip
 """Sentences, and what the system or packages say instead; the first counts, as CUDA calls full memory an error too."""

@@ -1,5 +1,6 @@
 """Read safetensors files, which execute no code; errors are one sentence."""
 
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,8 +27,8 @@ def open_tensors(path: Path, content: str, source: str, remedy: str = "copy it a
     Raises:
         InputError: no such file, another format, or cut short, also if the block finds out.
     """
-    if not path.is_file():
-        found = "a folder" if path.is_dir() else "no such file"
+    if not os.path.isfile(path):  # unlike Path.is_file, it takes names of any length
+        found = "a folder" if os.path.isdir(path) else "no such file"
         raise InputError(f"{path}: expected {content}, found {found}; {source}.")
     try:
         with safe_open(path, framework="pt") as file:

@@ -51,7 +51,7 @@ class File(NamedTuple):
     @property
     def exists(self) -> bool:
         """Whether there is such a file."""
-        return self.size is not None or self.path.is_file()
+        return self.size is not None or os.path.isfile(self.path)  # which no name is too long for
 
     def read(self) -> bytes:
         """Its bytes.
@@ -59,7 +59,7 @@ class File(NamedTuple):
         Raises:
             InputError: it cannot be read, or is shorter than it was.
         """
-        if self.path.exists() and not self.path.is_file():
+        if os.path.exists(self.path) and not os.path.isfile(self.path):
             raise InputError(f"{self.path}: cannot be read (a folder, a device or a pipe); give a file.")
         try:
             if self.size is None:
