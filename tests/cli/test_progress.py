@@ -207,7 +207,7 @@ def test_the_table_says_everything_in_words(scene, made):
     out = io.StringIO()
     print_report(Console(file=out, width=100), make_report([scene[0]], made, ReconstructConfig(), {"fit": 1.234}))
     text = out.getvalue()
-    expected = ("fit", "1.23 s", "total", "likeness to the photo", "30.0 dB", "new_measure", "0.1235")
+    expected = ("fit", "1.23 s", "total", "PSNR to the photo", "30.0 dB", "new_measure", "0.1235")
     for part in ("prior learned", *expected):
         assert part in text
     assert "Warning: the thumb is hidden" in text

@@ -173,7 +173,7 @@ def test_what_is_no_camera_is_refused_in_one_sentence(avatar_file, content, expe
     ("arguments", "expected"),
     [
         (["animate", "-o", "x.mp4", "--camera", "avatar.safetensors"], "not a camera"),
-        (["animate", "avatar.safetensors", "avatar.safetensors", "-o", "x.mp4"], "expected one, or two for one scene"),
+        (["animate", "avatar.safetensors", "avatar.safetensors", "-o", "x.mp4"], "expected one or two, got 3"),
         (["render", "-o", "x.bmp"], "ends in .png or .webp"),
         (["render", "-o", "x.jpg", "--background", "transparent"], "JPEG has no transparency"),
         (["render", "-o", "x.png", "--background", "mauve"], "--background mauve: expected white, black or six hex"),

@@ -13,11 +13,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             from oasis_warp.cli.app import main as run  # its imports take a while, in which Ctrl-C may come
         except OSError as error:  # too few files may be open, say
-            print(f"oasis: cannot be loaded ({error.strerror}); see `ulimit -a`, or install it again.", file=sys.stderr)
+            print(f"oasis: cannot be loaded ({error.strerror}); check `ulimit -a`, or reinstall.", file=sys.stderr)
             return 1
         return run(arguments)
     except KeyboardInterrupt:
-        print("oasis: stopped, nothing written.", file=sys.stderr)
+        print("oasis: stopped, nothing was written.", file=sys.stderr)
         return 130
     except BrokenPipeError:  # whoever read our output has gone, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # or Python complains when it flushes the rest

@@ -9,7 +9,7 @@ import sys
 import time
 import traceback
 from collections.abc import Sequence
-from typing import Annotated, Any, NoReturn, get_args
+from typing import Annotated, Any, NoReturn, Union, get_args
 
 import tyro
 
@@ -42,13 +42,13 @@ Command = (
 OWN_JSON = (options.Info, developer_options.Gradcheck)
 """Commands whose --json holds what they found."""
 SHORTAGES = {
-    "the memory of {device} is full; give smaller sizes, or fewer at once.": (
+    "the memory of {device} is full; use smaller sizes, or fewer at once.": (
         "MemoryError", "OutOfMemory", "out of memory", "can't allocate memory", "Cannot allocate memory",
         "Insufficient memory", "Failed to allocate", "failed to map segment", "bad allocation", "bad_alloc",
     ),
-    "too many files are open; allow this process more of them (`ulimit -n 1024`).": ("Too many open files",),
-    "a disk is full; free some room on it, also where temporary files lie.": ("No space left on device",),
-    "{device} failed in the middle of the work, nothing written; see what `oasis doctor` says.": ("CUDA error",),
+    "too many files are open; raise the limit (`ulimit -n 1024`).": ("Too many open files",),
+    "a disk is full; free some space, also in the folder of temporary files.": ("No space left on device",),
+    "{device} failed, nothing was written; run `oasis doctor`.": ("CUDA error",),
 }  # fmt: skip
 """Sentences, and what the system or packages say instead; the first counts, as CUDA calls full memory an error too."""
 COMMANDS = tuple(get_args(command)[1].name for command in get_args(Command))
@@ -64,10 +64,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
         _refuse_command(arguments[0])
     chosen = tyro.cli(
-        Command,
+        _overview() if arguments in (["--help"], ["-h"]) else Command,
         prog="oasis",
-        description=f"One photo of a hand in, an animatable 3D Gaussian avatar out. oasis_warp {__version__}, as "
-        "`oasis --version` says. `oasis COMMAND --help` explains a command.",
+        description="One photo of a hand in, an animatable 3D Gaussian avatar out. Version "
+        f"{__version__} (`oasis --version`). `oasis COMMAND --help` explains a command.",
         args=arguments,
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
     )
@@ -101,18 +101,26 @@ def _run(chosen: Any, verbose: bool) -> tuple[int, str | None]:
             traceback.print_exc()
         return BAD_INPUT, str(error)
     except KeyboardInterrupt:
-        return INTERRUPTED, "stopped, nothing written."
+        return INTERRUPTED, "stopped, nothing was written."
     except Exception as error:
         if (message := what_ran_out(error)) is None:
             raise
         return BAD_INPUT, message.format(device=getattr(chosen, "device", "cpu"))
 
 
+def _overview() -> Any:
+    """`Command` with one line of help per command."""
+    pairs = [get_args(command) for command in get_args(Command)]
+    first = {named.name: (kind.__doc__ or "").split("\n\n")[0] for kind, named in pairs}
+    short = [Annotated[kind, tyro.conf.subcommand(name.name, description=first[name.name])] for kind, name in pairs]
+    return Union[tuple(short)]  # noqa: UP007 - a list of types
+
+
 def _refuse_command(name: str) -> NoReturn:
-    """Say which command was meant, or which there are, and exit as after other wrong command lines."""
+    """Suggest the nearest command, or list all, and exit as after other wrong command lines."""
     hint = did_you_mean(name, COMMANDS).replace("Did", "did")
     answer = hint or f"expected one of {', '.join(COMMANDS)}."
-    print(f"oasis: {one_line(shortened(name))!r} is no command; {answer}", file=sys.stderr)
+    print(f"oasis: {one_line(shortened(name))!r} is not a command; {answer}", file=sys.stderr)
     raise SystemExit(BAD_INPUT)
 
 
