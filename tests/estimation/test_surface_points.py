@@ -107,6 +107,13 @@ def test_a_reading_needs_no_more_than_some_landmarks_and_repeats_its_bits(fitted
     assert first.hand.max() > 0.9
 
 
+@pytest.mark.parametrize("name", ["a2_lamp_right/07_pinch_down_back.jpg", "a4_door_right/01_flat_closed.jpg"])
+def test_shaded_skin_is_not_taken_for_a_thing_in_front_of_the_hand(fitted, name):
+    """Masks had holes of a third of the palm (IoU .87)."""
+    _, _, fit = fitted(f"same_hand/{name}")
+    assert fit.mask_iou > 0.94
+
+
 def test_two_pixels_of_the_crop_are_where_the_photo_has_them(fitted):
     photo, landmarks, _ = fitted("victory_right_09.jpg")
     read = read_pixels(photo.rgb.numpy(), landmarks.xy.numpy().astype(float))

@@ -49,7 +49,7 @@ def default_priors(network):
 
 @pytest.fixture(scope="module")
 def network(hand):
-    with torch.random.fork_rng():
+    with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         return HandNetwork(TINY, hand)
 

@@ -6,6 +6,7 @@ one line in the manifest and one folder, and nothing else may be left. Prints a 
 """
 
 import argparse
+import atexit
 import contextlib
 import json
 import random
@@ -159,6 +160,7 @@ def main() -> None:
             code = None
             while code is None:  # until a run comes to its end
                 cluster = Cluster(photos, out, options.victim == "scheduler")
+                atexit.register(cluster.end)  # whatever goes wrong here
                 while kills < options.count and kill_once(cluster, options.victim, rng, out):
                     kills += 1
                     check(out, counts)

@@ -38,7 +38,7 @@ def batch(crops):
 def make_network(hand):
     def make(config, awake=True):
         """Seeded weights; `awake` ones have heads that say something, and gates and biases that are not at rest."""
-        with torch.random.fork_rng():
+        with torch.random.fork_rng(devices=[]):  # weights are made on the CPU
             torch.manual_seed(0)
             network = HandNetwork(config, hand)
             if awake:

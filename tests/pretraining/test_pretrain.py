@@ -44,7 +44,7 @@ CONFIG = PretrainConfig(steps=4, warmup=2, precision="float32", checkpoint_every
 
 
 def small_network(hand, **switches):
-    with torch.random.fork_rng():
+    with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         return HandNetwork(replace(SMALL, **switches), hand)
 

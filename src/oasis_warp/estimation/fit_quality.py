@@ -55,8 +55,8 @@ class Bounds:
     cost: float
 
 
-WARN_BOUNDS = Bounds(reprojection=4.5, worst_point=11.0, mask_iou=0.91, cost=320.0)
-REFUSE_BOUNDS = Bounds(reprojection=6.5, worst_point=np.inf, mask_iou=0.85, cost=640.0)
+WARN_BOUNDS = Bounds(reprojection=4.5, worst_point=11.0, mask_iou=0.91, cost=280.0)
+REFUSE_BOUNDS = Bounds(reprojection=6.5, worst_point=np.inf, mask_iou=0.85, cost=560.0)
 
 
 @dataclass(frozen=True)

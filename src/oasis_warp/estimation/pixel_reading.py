@@ -22,6 +22,10 @@ SIDE = 256
 """Side of the crop that the network reads [px]; a multiple of 16."""
 MARGIN = 1.6
 """Side of the crop over the longer side of the landmarks' box."""
+RARE_FRONT = 3.0
+"""Logarithm of how much rarer things in front of a hand are in users' photos than in training, where 16 % of photos
+have one (Bayes' rule). Without it shaded palms counted as such things. Chosen on the 52 photos of single hands, whose
+masks then overlap the fit by .937 instead of .908 at 5 %, and .963 instead of .959 in the median."""
 
 
 @dataclass(frozen=True)
@@ -99,11 +103,13 @@ def read_pixels(rgb: np.ndarray, xy: np.ndarray, network: DenseNetwork | None = 
         image = torch.from_numpy(crop).to(device).permute(2, 0, 1)[None].float() / 255
         points = torch.from_numpy((xy - corner) * scale)[None].float().to(device)
         out = network(image.contiguous(memory_format=torch.channels_last), points)
+        classes = out.classes[0].clone()
+        classes[FRONT] -= RARE_FRONT
         return PixelReading(
             corner,
             scale,
             crop,
-            out.classes[0].softmax(0).cpu().numpy(),
+            classes.softmax(0).cpu().numpy(),
             SURFACE_UNIT * out.surface[0].cpu().numpy(),
             SURFACE_UNIT * out.log_scale[0].exp().cpu().numpy(),
             out.normal[0].cpu().numpy(),
