@@ -77,6 +77,34 @@ def test_a_wrong_command_line_exits_with_two(arguments, capsys):
     assert "Traceback" not in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("", "expected one of reconstruct, batch, render,"),
+        ("bench", "bench: expected one of kernels, error-time, scaling, roofline; see `oasis bench --help`."),
+        ("render", "render: expected AVATAR and -o PATH, got none; see `oasis render --help`."),
+        ("render a b -o c.png", "render: b is one name too many; see `oasis render --help`."),
+        ("render a -o b.png --sise 10", "--sise: not an option of `oasis render` (did you mean '--size'?); see `oasis"),
+        ("render a -o b.png --size abc", "--size abc: expected a whole number; see `oasis render --help`."),
+        ("render a -o b.png --azimuth left", "--azimuth left: expected a number; see `oasis render --help`."),
+        ("render a -o b.png --device gpu", "--device gpu: expected one of cpu, cuda; see `oasis render --help`."),
+        ("render a -o b.png --pose", "--pose: expected a value, got none; see `oasis render --help`."),
+        ("reconstruct a -o b --hand both", "--hand both: expected left, right, largest or a whole number; see"),
+        ("reconstruct a -o b --lpips c", "--lpips c: expected 2 values; see `oasis reconstruct --help`."),
+        ("--quiet", "--quiet: not an option of `oasis`; see `oasis --help`."),
+        ("render a -o b.png --\x1b[31mred 1", "not an option of `oasis render`"),
+    ],
+)
+@pytest.mark.parametrize("columns", ["40", "100"])
+def test_a_wrong_command_line_is_told_in_one_sentence(line, expected, columns, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", columns)
+    with pytest.raises(SystemExit) as stopped:
+        main(line.split())
+    assert stopped.value.code == 2
+    output = capsys.readouterr().err
+    assert expected in output and output.startswith("oasis: ") and output.count("\n") == 1 and "\x1b" not in output
+
+
 def test_every_command_takes_json_quiet_and_verbose():
     for command in get_args(app.Command):
         kinds = get_args(command)

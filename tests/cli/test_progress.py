@@ -2,16 +2,19 @@
 
 import contextlib
 import io
+import itertools
 import json
 import os
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from rich.console import Console
 
 from oasis_warp.avatar.quality import SurfaceQuality
+from oasis_warp.cli import summary
 from oasis_warp.cli.progress import (
     EDIT_PLAN,
     USUAL_STEPS,
@@ -326,6 +329,24 @@ def panels(made, visibility):
     side, top = panel_side(4, WIDTH), 24 + 44
     assert sheet.shape[1] == WIDTH
     return [sheet[top : top + side, 24 + k * (side + 12) :][:, :side].astype(float) for k in range(4)]
+
+
+def test_words_under_a_panel_end_before_the_next_one(made, monkeypatch):
+    """The legend stood under two panels and ran into the second."""
+    places = []
+    write = summary.write_text
+
+    def measured(sheet, text, x, y, size, color, weight):
+        write(sheet, text, x, y, size, color, weight)
+        left, _, width, _ = cv2.getTextSize(sheet.shape[1::-1], text, (x, y), cv2.FontFace("sans"), size, weight)
+        places.append((y, left, left + width))
+
+    monkeypatch.setattr(summary, "write_text", measured)
+    n = len(made.avatar.hand.template)
+    draw_quality("a hand", made.avatar, SurfaceQuality(torch.ones(n), torch.zeros(n), torch.zeros(n)))
+    for row in {y for y, *_ in places}:
+        ends = [place[1:] for place in places if place[0] == row]
+        assert all(before[1] < after[0] for before, after in itertools.pairwise([*ends, [WIDTH, WIDTH]]))
 
 
 def hue(panel):

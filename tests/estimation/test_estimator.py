@@ -251,7 +251,7 @@ def test_a_hand_is_chosen_by_side_number_or_size(fitted):
 @pytest.mark.parametrize(("which", "words"), [("left", "a left hand"), (1, "hand 1"), (-1, "hand -1")])
 def test_a_hand_that_was_not_found_is_asked_for_in_vain(fitted, which, words):
     hands = found_hands(fitted)[:1]
-    with pytest.raises(InputError, match=rf"p\.jpg: expected {words}, found 0: right, \d+ px"):
+    with pytest.raises(InputError, match=rf"p\.jpg: expected {words}, found hand 0 \(right, \d+ px\)"):
         choose_hand(hands, which, "p.jpg")
 
 

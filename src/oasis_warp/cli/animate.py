@@ -14,7 +14,7 @@ from oasis_warp.cli.record import written
 from oasis_warp.cli.render import check_numbers, choose_pose, load_avatar, read_color, straight_alpha
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import BLACK
-from oasis_warp.core.errors import InputError
+from oasis_warp.core.errors import InputError, did_you_mean
 from oasis_warp.core.logging import Progress
 from oasis_warp.core.processes import single_threaded_math
 from oasis_warp.core.types import Camera, Color, Gaussians, HandPose
@@ -26,6 +26,7 @@ from oasis_warp.motion import read_motion, resample
 from oasis_warp.render import render
 
 MAX_FRAMES = 10_000
+MOTIONS = ("turntable", "poses")
 MAX_LOOPS = 65_535
 """What a GIF can count to."""
 MAX_FRAMED = 60
@@ -157,6 +158,9 @@ def _poses(avatar: Avatar, options: Animate, n_frames: int, names: list[str], pr
     if not isinstance(options.motion, Path):
         angles = pose_sequence(avatar.hand, names, max(1, round(n_frames / len(names))), avatar.rest)
         return [avatar.source_pose._replace(angles=each) for each in angles]
+    if not options.motion.suffix:
+        hint = did_you_mean(str(options.motion), MOTIONS) or "Choose one."
+        raise InputError(f"--motion {options.motion}: expected {', '.join(MOTIONS)} or a motion file. {hint}")
     motion = resample(read_motion(options.motion, avatar, progress=progress), options.fps)
     count_frames(len(motion.angles) / options.fps, options.fps)
     if options.wrist == "still":

@@ -1,5 +1,7 @@
 """The command line, `oasis`: read it, run the command, turn what goes wrong into one sentence and an exit code."""
 
+import contextlib
+import dataclasses
 import importlib
 import io
 import logging
@@ -15,6 +17,7 @@ import tyro
 
 from oasis_warp import __version__
 from oasis_warp.cli import developer_options, options
+from oasis_warp.cli.command_line import explain
 from oasis_warp.cli.progress import BAD_INPUT, INTERRUPTED
 from oasis_warp.cli.record import recorded, write_record
 from oasis_warp.core.errors import InputError, did_you_mean, one_line, shortened
@@ -63,14 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
         _refuse_command(arguments[0])
-    chosen = tyro.cli(
-        _overview() if arguments in (["--help"], ["-h"]) else Command,
-        prog="oasis",
-        description="One photo of a hand in, an animatable 3D Gaussian avatar out. Version "
-        f"{__version__} (`oasis --version`). `oasis COMMAND --help` explains a command.",
-        args=arguments,
-        config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
-    )
+    chosen = _parse(arguments)
     logging.basicConfig(format="oasis: %(message)s")
     verbose = getattr(chosen, "verbose", False)
     logging.getLogger("oasis_warp").setLevel(logging.INFO if verbose else logging.WARNING)
@@ -106,6 +102,35 @@ def _run(chosen: Any, verbose: bool) -> tuple[int, str | None]:
         if (message := what_ran_out(error)) is None:
             raise
         return BAD_INPUT, message.format(device=getattr(chosen, "device", "cpu"))
+
+
+def _parse(arguments: Sequence[str]) -> Any:
+    """The options of the command; exits after help, and with one sentence after a wrong command line."""
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(
+                _overview() if arguments in (["--help"], ["-h"]) else Command,
+                prog="oasis",
+                description="One photo of a hand in, an animatable 3D Gaussian avatar out. Version "
+                f"{__version__} (`oasis --version`). `oasis COMMAND --help` explains a command.",
+                args=arguments,
+                config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+            )
+    except SystemExit as stopped:
+        if not stopped.code:
+            raise
+        print(f"oasis: {_explain(said.getvalue(), arguments)}", file=sys.stderr)
+        raise SystemExit(BAD_INPUT) from None
+
+
+def _explain(said: str, arguments: Sequence[str]) -> str:
+    """One sentence about a wrong command line, from what tyro says about it."""
+    kinds = {name.name: kind for kind, name in map(get_args, get_args(Command))}
+    if not arguments or arguments[0] not in kinds:
+        return explain(said, arguments, "oasis")
+    parts = dataclasses.fields(kinds[arguments[0]])
+    return explain(said, arguments, f"oasis {arguments[0]}", [f"--{part.name.replace('_', '-')}" for part in parts])
 
 
 def _overview() -> Any:

@@ -101,7 +101,7 @@ def check_options(options: Evaluate) -> None:
     if options.selection is not None and options.dataset != "interhand":
         raise InputError("--selection: works only with --dataset interhand; leave it out.")
     if photos and options.folder is None:
-        kind = "a folder of photos" + (", or one with a subfolder a hand" if options.dataset == "same-hand" else "")
+        kind = "a folder of photos" + (", or of subfolders, one per hand" if options.dataset == "same-hand" else "")
         raise InputError(f"--dataset {options.dataset}: expected {kind}; name it.")
     if not photos and options.folder is not None:
         kind = "a data set has --root" if published else "synthetic hands need no folder"

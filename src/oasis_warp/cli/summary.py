@@ -186,13 +186,16 @@ def draw_quality(title: str, avatar: Avatar, quality: SurfaceQuality) -> UInt8[T
     shown = torch.tensor(UNSEEN_COLOR).repeat(len(visibility), 1)
     shown[visibility > 0] = torch.tensor(GRAZED_COLOR)
     shown[visibility >= SEEN] = torch.tensor(SEEN_COLOR)
-    legend = f"seen (green), grazing (yellow){'' if quality.invented is None else ', inpainted (grey)'}"
     panels = [
         Panel(_paint(posed, faces, colors, orbit_camera(posed.vertices, azimuth, size=side)), f"{what}, {where}")
-        for what, colors in ((legend, shown), ("uncertainty", _heat(quality.uncertainty)))
+        for what, colors in (("visibility", shown), ("uncertainty", _heat(quality.uncertainty)))
         for where, azimuth in (("from the photo's side", 0.0), ("from behind", math.pi))
     ]  # fmt: skip
-    subtitle = "uncertainty: blue is as in the photo, yellow is guessed"
+    unseen = "unseen" if quality.invented is None else "inpainted"
+    subtitle = (
+        f"visibility: green is seen, yellow at grazing angles, grey {unseen}; "
+        "uncertainty: blue is as in the photo, yellow is guessed"
+    )
     return torch.from_numpy(make_sheet(title, subtitle, [panels], WIDTH))
 
 

@@ -203,9 +203,9 @@ def choose_hand(
             return of_side[0]
         wanted = f"a {which} hand"
     listed = ", ".join(
-        f"{i}: {hand.side}, {box_size(array(hand.xy)):.0f} px" for i, hand in enumerate(found)
+        f"hand {i} ({hand.side}, {box_size(array(hand.xy)):.0f} px)" for i, hand in enumerate(found)
     )
-    raise InputError(f"{photo_name}: expected {wanted}, found {listed}; choose one of these, or mirror the photo.")
+    raise InputError(f"{photo_name}: expected {wanted}, found {listed}; choose another --hand, or mirror the photo.")
 
 
 def shared_shape(shapes: Sequence[Float[Tensor, "S"]]) -> Float[Tensor, "S"]:
