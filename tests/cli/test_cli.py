@@ -1,9 +1,11 @@
 """The command line itself, and the commands that answer in words: `oasis info` and `oasis doctor`."""
 
+import contextlib
 import itertools
 import json
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import tomllib
@@ -17,6 +19,7 @@ import torch
 
 from oasis_warp import __version__
 from oasis_warp.cli import app, doctor, main, options
+from oasis_warp.core.errors import InputError
 from oasis_warp.hand.poses import POSE_NAMES
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.network import prior as home
@@ -164,6 +167,43 @@ def test_quiet_says_only_what_is_wrong_and_verbose_where(avatar_file, tmp_path, 
         assert main([*arguments, verbose, "--fps", "0"]) == 2
         output = capsys.readouterr().err
         assert "in count_frames" in output and output.splitlines()[-1].startswith("oasis: --fps 0")
+
+
+@pytest.mark.parametrize("swallowed", [ValueError("could not determine the shape"), InputError("x: damaged.")])
+def test_an_interrupt_that_a_library_turns_into_another_error_is_still_one(monkeypatch, capsys, swallowed):
+    """safetensors does."""
+
+    def run(chosen):
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        raise swallowed
+
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(doctor, "run", run)
+    assert main(["doctor"]) == 130
+    assert capsys.readouterr().err == "oasis: stopped, nothing was written.\n"
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+
+LEAVE = """
+import atexit, os, signal, sys
+from oasis_warp.cli import doctor, main
+class Crash:
+    def __del__(self):
+        os.abort()
+crash = Crash()
+crash.itself = crash
+atexit.register(print, "cleaned up")
+doctor.run = lambda chosen: signal.raise_signal(signal.SIGINT)
+sys.argv = ["oasis", "doctor"]
+sys.exit(main())
+"""
+
+
+def test_a_process_that_is_interrupted_cleans_up_and_does_not_crash_at_its_end():
+    done = subprocess.run([sys.executable, "-c", LEAVE], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (130, "cleaned up\n")
+    assert done.stderr == "oasis: stopped, nothing was written.\n"
 
 
 COMPLETE = """

@@ -8,6 +8,7 @@ import logging
 import os
 import signal
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Sequence
@@ -42,6 +43,7 @@ Command = (
     | Annotated[developer_options.Doctor, tyro.conf.subcommand("doctor")]
 )
 
+STOPPED = "stopped, nothing was written."
 OWN_JSON = (options.Info, developer_options.Gradcheck)
 """Commands whose --json holds what they found."""
 SHORTAGES = {
@@ -71,34 +73,48 @@ def main(arguments: Sequence[str] | None = None) -> int:
     verbose = getattr(chosen, "verbose", False)
     logging.getLogger("oasis_warp").setLevel(logging.INFO if verbose else logging.WARNING)
     # A batch system's SIGTERM ends the work as Ctrl-C does: what is half-written is taken away.
-    before, start = signal.signal(signal.SIGTERM, signal.default_int_handler), time.monotonic()
+    interrupted = threading.Event()
+
+    def interrupt(number: int, frame: Any) -> NoReturn:
+        interrupted.set()
+        signal.default_int_handler(number, frame)
+
+    before, start = {signal.SIGTERM: signal.signal(signal.SIGTERM, interrupt)}, time.monotonic()
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else whoever started this ignores it
+        before[signal.SIGINT] = signal.signal(signal.SIGINT, interrupt)
     try:
         with recorded(chosen, arguments) as record:
-            code, message = _run(chosen, verbose)
+            code, message = _run(chosen, verbose, interrupted)
             if getattr(chosen, "json", None) is not None and not isinstance(chosen, OWN_JSON):
                 write_record(chosen, record, code, message, start)
     except InputError as error:  # of the record
         code, message = BAD_INPUT, str(error)
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
     if message is not None:
         print(f"oasis: {message}", file=sys.stderr)
     return code
 
 
-def _run(chosen: Any, verbose: bool) -> tuple[int, str | None]:
-    """Run a command; its exit code, and a sentence about what went wrong."""
+def _run(chosen: Any, verbose: bool, interrupted: threading.Event) -> tuple[int, str | None]:
+    """Run a command; its exit code, and a sentence about what went wrong.
+
+    Libraries of compiled code may turn Ctrl-C into another error, so every error after it counts as an interrupt.
+    """
     try:
         # The command's module imports torch and Warp, which take seconds: only now.
         command = importlib.import_module(f"oasis_warp.cli.{type(chosen).__name__.lower()}")
         return command.run(chosen), None
-    except InputError as error:
-        if verbose:
-            traceback.print_exc()
-        return BAD_INPUT, str(error)
     except KeyboardInterrupt:
-        return INTERRUPTED, "stopped, nothing was written."
+        return INTERRUPTED, STOPPED
     except Exception as error:
+        if interrupted.is_set():
+            return INTERRUPTED, STOPPED
+        if isinstance(error, InputError):
+            if verbose:
+                traceback.print_exc()
+            return BAD_INPUT, str(error)
         if (message := what_ran_out(error)) is None:
             raise
         return BAD_INPUT, message.format(device=getattr(chosen, "device", "cpu"))

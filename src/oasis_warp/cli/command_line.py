@@ -70,5 +70,5 @@ def _kinds(placeholder: str) -> str:
     """The placeholder of an option in words: `{left,right}|INT` is "left, right or a whole number"."""
     names: list[str] = []
     for kind in re.findall(r"\{[^}]*\}|[^|{}]+", placeholder):
-        names += kind[1:-1].split(",") if kind[0] == "{" else [KINDS.get(kind, kind)]
+        names.extend(kind[1:-1].split(",") if kind[0] == "{" else [KINDS.get(kind, kind)])
     return " or ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)
