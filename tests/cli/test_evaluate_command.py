@@ -273,7 +273,7 @@ def test_folders_without_pairs_are_refused_in_one_sentence(hands, tmp_path, caps
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--dataset", "same-hand"], "expected a folder of photos, or one with a subfolder a hand; name it"),
+        (["--dataset", "same-hand"], "expected a folder of photos, or of subfolders, one per hand; name it"),
         (["photos"], "photos: synthetic hands need no folder"),
         (["--people", "0"], "--people: expected 1 or more, got 0"),
         (["--targets", "9"], "--targets: expected 1 to 8, got 9"),

@@ -15,6 +15,7 @@ from rich.console import Console
 
 from oasis_warp.avatar.quality import SurfaceQuality
 from oasis_warp.cli import summary
+from oasis_warp.cli.options import Reconstruct as ReconstructOptions
 from oasis_warp.cli.progress import (
     EDIT_PLAN,
     USUAL_STEPS,
@@ -22,12 +23,13 @@ from oasis_warp.cli.progress import (
     Run,
     Terminal,
     line_progress,
+    plain_console,
     reconstruct_plan,
     show_progress,
     show_run,
 )
 from oasis_warp.cli.record import recorded
-from oasis_warp.cli.report import make_report, print_report, to_json
+from oasis_warp.cli.report import make_report, print_report, print_warnings, to_json
 from oasis_warp.cli.summary import (
     FINGER_COLORS,
     PAPER,
@@ -368,3 +370,12 @@ def test_the_palm_and_the_back_are_told_apart(made):
     front, behind, *_ = panels(made, palm)
     green = [(np.argmax(panel, -1) == 1).mean() for panel in (front, behind)]
     assert green[0] > 2 * green[1]
+
+
+@pytest.mark.parametrize("quiet", [True, False])
+def test_warnings_are_printed_even_when_quiet(quiet, capsys):
+    with recorded(ReconstructOptions(photos=(), out=Path("out"), quiet=quiet), ["reconstruct"]):
+        print_warnings(plain_console(), ["the thumb is hidden"])
+    captured = capsys.readouterr()
+    said, silent = (captured.err, captured.out) if quiet else (captured.out, captured.err)
+    assert (said, silent) == ("Warning: the thumb is hidden\n", "")
