@@ -44,7 +44,7 @@ TRUSTED, FEWEST = 0.8, 150
 """Confidence of a vertex's colour that counts, and vertices of a region that must be seen so well."""
 POOR = "poor fit"
 """Begins warnings of a fit that is not forced."""
-WARNINGS = {"any warning": "", "the fit's numbers": POOR, "second look": "second look", "side": "side doubtful"}
+WARNINGS = {"any warning": "", "the fit's numbers": POOR, "second detection": "a second ", "side": "side doubtful"}
 """Columns of the table of faults, and the words by which their warnings are told."""
 
 

@@ -114,7 +114,7 @@ def test_a_left_hand_is_the_mirror_image_of_a_right_one(truth, painted, made):
 
 
 def test_without_photo_and_mask_nothing_is_guessed(truth, painted):
-    with pytest.raises(InputError, match="give the photo from before as well, or a mask"):
+    with pytest.raises(InputError, match="also give the original photo, or a mask"):
         edit(truth.avatar, painted)
 
 
@@ -126,14 +126,14 @@ def test_a_photo_without_paint_is_refused(truth):
 def test_a_wholly_different_picture_is_not_said_to_lack_paint(truth):
     noise = torch.randint(0, 256, truth.photo.rgb.shape, generator=torch.Generator().manual_seed(0)).to(torch.uint8)
     other = truth.photo._replace(rgb=noise, name="other.png")
-    with pytest.raises(InputError, match=f"^other.png: is another picture than {truth.photo.name}; paint on a copy"):
+    with pytest.raises(InputError, match=f"^other.png: does not match {truth.photo.name}; paint on a copy"):
         edit(truth.avatar, other, photo=truth.photo, config=QUICK)
 
 
 def test_a_photo_of_something_else_is_refused(truth):
     noise = torch.randint(0, 256, (200, 260, 3), generator=torch.Generator().manual_seed(0)).to(torch.uint8)
     other = Photo(noise, None, None, "noise.png", 1.0)
-    with pytest.raises(InputError, match=r"noise\.png: does not show the avatar's hand"):
+    with pytest.raises(InputError, match=r"noise\.png: does not match the avatar"):
         edit(truth.avatar, other, photo=other)
 
 

@@ -83,7 +83,7 @@ def edit(
     check_config(config)
     if photo is None and mask is None:
         raise InputError(
-            f"{painted.name}: what is paint cannot be told; give the photo from before as well, or a mask."
+            f"{painted.name}: the paint cannot be told from the photo; also give the original photo, or a mask."
         )
     stages: dict[str, float] = {}
 
@@ -132,7 +132,7 @@ def _compare(painted: Photo, photo: Photo | None, mask: Photo | None) -> tuple[T
     else:
         if photo is not None and float((image - before).abs().mean(-1).median()) > OTHER_PHOTO:
             raise InputError(
-                f"{painted.name}: is another picture than {photo.name}; paint on a copy of that one, or give a mask."
+                f"{painted.name}: does not match {photo.name}; paint on a copy of that photo, or give a mask."
             )
         paint = find_paint(before, image)
     return image, before, paint
@@ -142,7 +142,7 @@ def _find_hand(avatar: Avatar, picture: Tensor, name: str) -> Square:
     drawn = avatar.render(avatar.source_camera, avatar.source_pose, BLACK)
     square = find_square(drawn.image.cpu(), drawn.alpha.cpu(), picture)
     if square.difference > OTHER_PHOTO:
-        raise InputError(f"{name}: does not show the avatar's hand as its own photo did; give that photo, whole.")
+        raise InputError(f"{name}: does not match the avatar; give the whole photo that the avatar was made from.")
     return square
 
 

@@ -205,7 +205,7 @@ def _run(
 ) -> _Outcome:  # fmt: skip
     """All stages, in their order. `keypoints` are those of a single photo."""
     if config.adapt == "lora" and len(photos) > 1:
-        raise InputError(f"adapt lora: learns one photo, got {len(photos)}; leave it out for several of a hand.")
+        raise InputError(f"adapt lora: works with one photo, got {len(photos)}; leave it out for several photos.")
     stages: dict[str, float] = {}
     stage = functools.partial(timed_stage, seconds=stages, progress=progress)
     hand = chosen_hand(config.hand_model, config.mano_dir)

@@ -339,7 +339,7 @@ def test_faint_paint_is_found_in_an_exact_copy(photo):
 
 def test_a_cut_or_turned_copy_is_refused_in_one_sentence(photo):
     for width, height in ((416, 416), (555, 416), (416, 400)):
-        with pytest.raises(InputError, match=f"painted.png: {width} x {height} pixels are no scaled copy"):
+        with pytest.raises(InputError, match=f"painted.png: {width} x {height} pixels do not have the proportions"):
             match_size(photo, width, height, "painted.png")
 
 

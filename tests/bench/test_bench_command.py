@@ -58,7 +58,7 @@ def test_an_interrupted_measurement_leaves_nothing(short, monkeypatch, tmp_path,
     monkeypatch.setattr(error_time, "measure_settings_of", interrupt)
     assert main(["bench", "error-time", "-o", str(tmp_path / "out"), "--repeats", "2"]) == 130
     assert list(tmp_path.iterdir()) == []
-    assert capsys.readouterr().err.endswith("oasis: stopped, nothing written.\n")
+    assert capsys.readouterr().err.endswith("oasis: stopped, nothing was written.\n")
 
 
 @pytest.mark.slow

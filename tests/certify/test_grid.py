@@ -250,5 +250,5 @@ def test_an_interrupt_ends_the_processes_of_the_grid_and_leaves_no_file(tmp_path
     finally:
         running.kill()
     assert running.returncode == 130
-    assert err.splitlines()[-1] == "oasis: stopped, nothing written." and "Traceback" not in err
+    assert err.splitlines()[-1] == "oasis: stopped, nothing was written." and "Traceback" not in err
     assert not list(tmp_path.iterdir())

@@ -146,7 +146,7 @@ def test_few_photos_are_shared_by_all_workers_and_many_by_few_tasks(n, workers, 
     ("options", "output"),
     [
         (["--workers", "0"], "--workers 0: expected 1 or more"),
-        (["--workers", "2", "--scheduler", "tcp://127.0.0.1:1"], "give one of the two"),
+        (["--workers", "2", "--scheduler", "tcp://127.0.0.1:1"], "exclude each other"),
         ([], "pip install 'oasis-warp[batch]'"),
     ],
 )

@@ -1,8 +1,11 @@
 """The command line itself, and the commands that answer in words: `oasis info` and `oasis doctor`."""
 
+import contextlib
+import itertools
 import json
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import tomllib
@@ -16,6 +19,7 @@ import torch
 
 from oasis_warp import __version__
 from oasis_warp.cli import app, doctor, main, options
+from oasis_warp.core.errors import InputError
 from oasis_warp.hand.poses import POSE_NAMES
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.network import prior as home
@@ -76,11 +80,64 @@ def test_a_wrong_command_line_exits_with_two(arguments, capsys):
     assert "Traceback" not in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("", "expected one of reconstruct, batch, render,"),
+        ("bench", "bench: expected one of kernels, error-time, scaling, roofline; see `oasis bench --help`."),
+        ("render", "render: expected AVATAR and -o PATH, got none; see `oasis render --help`."),
+        ("render a b -o c.png", "render: b is one name too many; see `oasis render --help`."),
+        ("render a -o b.png --sise 10", "--sise: not an option of `oasis render` (did you mean '--size'?); see `oasis"),
+        ("render a -o b.png --size abc", "--size abc: expected a whole number; see `oasis render --help`."),
+        ("render a -o b.png --azimuth left", "--azimuth left: expected a number; see `oasis render --help`."),
+        ("render a -o b.png --device gpu", "--device gpu: expected one of cpu, cuda; see `oasis render --help`."),
+        ("render a -o b.png --pose", "--pose: expected a value, got none; see `oasis render --help`."),
+        ("reconstruct a -o b --hand both", "--hand both: expected left, right, largest or a whole number; see"),
+        ("reconstruct a -o b --lpips c", "--lpips c: expected 2 values; see `oasis reconstruct --help`."),
+        ("--quiet", "--quiet: not an option of `oasis`; see `oasis --help`."),
+        ("render a -o b.png --\x1b[31mred 1", "not an option of `oasis render`"),
+    ],
+)
+@pytest.mark.parametrize("columns", ["40", "100"])
+def test_a_wrong_command_line_is_told_in_one_sentence(line, expected, columns, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", columns)
+    with pytest.raises(SystemExit) as stopped:
+        main(line.split())
+    assert stopped.value.code == 2
+    output = capsys.readouterr().err
+    assert expected in output and output.startswith("oasis: ") and output.count("\n") == 1 and "\x1b" not in output
+
+
 def test_every_command_takes_json_quiet_and_verbose():
     for command in get_args(app.Command):
         kinds = get_args(command)
         if kinds[1].name != "bench":  # its own commands write tables
             assert {"json", "quiet", "verbose"} <= set(kinds[0].__dataclass_fields__), kinds[1].name
+
+
+def _helped(capsys, *arguments):
+    with pytest.raises(SystemExit) as stopped:
+        main([*arguments, "--help"])
+    assert stopped.value.code == 0
+    return capsys.readouterr().out
+
+
+def test_help_lists_each_command_on_two_lines_at_most_and_the_short_options(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    lines = _helped(capsys).splitlines()
+    starts = [n for n, line in enumerate(lines) if "   • " in line]
+    assert len(starts) == len(app.COMMANDS)
+    assert max(b - a for a, b in itertools.pairwise([*starts, len(lines) - 1])) <= 2
+    text = _helped(capsys, "render")
+    assert "-q, --quiet" in text and "-v, --verbose" in text and "--json PATH" in text
+
+
+@pytest.mark.parametrize("command", [*app.COMMANDS, "bench kernels", "bench scaling", "bench error-time"])
+def test_help_names_no_default_that_says_nothing(command, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    text = " ".join(_helped(capsys, *command.split()).replace("│", " ").split())
+    for nothing in ("(default: None)", "(default: False)", "(default: )", "(default: '')", "{None}", "None,"):
+        assert nothing not in text
 
 
 def test_json_holds_the_exact_command_and_what_it_wrote_or_what_went_wrong(avatar_file, tmp_path, capsys):
@@ -101,13 +158,52 @@ def test_json_holds_the_exact_command_and_what_it_wrote_or_what_went_wrong(avata
 
 def test_quiet_says_only_what_is_wrong_and_verbose_where(avatar_file, tmp_path, capsys):
     arguments = ["animate", str(avatar_file), "-o", str(tmp_path / "x.gif"), "--size", "32", "--seconds", "0.1"]
-    assert main([*arguments, "--quiet"]) == 0
-    assert capsys.readouterr() == ("", "")
+    for quiet in ("--quiet", "-q"):
+        assert main([*arguments, quiet]) == 0
+        assert capsys.readouterr() == ("", "")
     assert main([*arguments, "--quiet", "--fps", "0"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
-    assert main([*arguments, "--verbose", "--fps", "0"]) == 2
-    output = capsys.readouterr().err
-    assert "in count_frames" in output and output.splitlines()[-1].startswith("oasis: --fps 0")
+    for verbose in ("--verbose", "-v"):
+        assert main([*arguments, verbose, "--fps", "0"]) == 2
+        output = capsys.readouterr().err
+        assert "in count_frames" in output and output.splitlines()[-1].startswith("oasis: --fps 0")
+
+
+@pytest.mark.parametrize("swallowed", [ValueError("could not determine the shape"), InputError("x: damaged.")])
+def test_an_interrupt_that_a_library_turns_into_another_error_is_still_one(monkeypatch, capsys, swallowed):
+    """safetensors does."""
+
+    def run(chosen):
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        raise swallowed
+
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(doctor, "run", run)
+    assert main(["doctor"]) == 130
+    assert capsys.readouterr().err == "oasis: stopped, nothing was written.\n"
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+
+LEAVE = """
+import atexit, os, signal, sys
+from oasis_warp.cli import doctor, main
+class Crash:
+    def __del__(self):
+        os.abort()
+crash = Crash()
+crash.itself = crash
+atexit.register(print, "cleaned up")
+doctor.run = lambda chosen: signal.raise_signal(signal.SIGINT)
+sys.argv = ["oasis", "doctor"]
+sys.exit(main())
+"""
+
+
+def test_a_process_that_is_interrupted_cleans_up_and_does_not_crash_at_its_end():
+    done = subprocess.run([sys.executable, "-c", LEAVE], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (130, "cleaned up\n")
+    assert done.stderr == "oasis: stopped, nothing was written.\n"
 
 
 COMPLETE = """
@@ -143,7 +239,7 @@ def test_an_interrupt_is_told_and_exits_with_130(capsys, monkeypatch, avatar_fil
 
     monkeypatch.setattr(render, "orbit_camera", interrupt)
     assert main(["render", str(avatar_file), "-o", str(avatar_file.with_name("x.png"))]) == 130
-    assert capsys.readouterr().err == "oasis: stopped, nothing written.\n"
+    assert capsys.readouterr().err == "oasis: stopped, nothing was written.\n"
     assert not avatar_file.with_name("x.png").exists()
 
 
@@ -170,7 +266,7 @@ def test_the_command_line_offers_every_pose():
 def test_a_mistyped_command_is_answered_with_the_nearest_one(command, answer, capsys):
     with pytest.raises(SystemExit):
         main([command, "a.jpg"])
-    assert capsys.readouterr().err.startswith(f"oasis: {command!r} is no command; {answer}")
+    assert capsys.readouterr().err.startswith(f"oasis: {command!r} is not a command; {answer}")
 
 
 def test_the_facts_are_those_of_the_avatar(avatar_file, tmp_path, capsys):
@@ -203,10 +299,10 @@ def test_a_comparison_names_what_differs_and_nothing_else(scene, avatar_file, tm
     record = tmp_path / "record.json"
     assert main(["compare", str(one), str(other), "-o", str(tmp_path / "both.png"), "--json", str(record)]) == 0
     output = capsys.readouterr().out
-    assert "--seed" in output and "--size" not in output and "31.5 dB" in output and "overlap of fit" not in output
+    assert "--seed" in output and "--size" not in output and "31.5 dB" in output and "mask IoU of the fit" not in output
     facts = json.loads(record.read_text())
     assert facts["different"]["--seed"] == ["0", "3"]
-    assert facts["different"]["their median size"] == pytest.approx([3, 2.7])
+    assert facts["different"]["median size of a Gaussian"] == pytest.approx([3, 2.7])
     assert "side" not in facts["different"]
     assert all(20 < value < 60 for value in facts["likeness_db"])
     assert np.asarray(cv2.imread(str(tmp_path / "both.png"))).shape[1] == 1200
@@ -215,7 +311,7 @@ def test_a_comparison_names_what_differs_and_nothing_else(scene, avatar_file, tm
 def test_an_avatar_differs_in_nothing_from_itself(avatar_file, tmp_path, capsys):
     record = tmp_path / "record.json"
     assert main(["compare", str(avatar_file), str(avatar_file), "--json", str(record)]) == 0
-    assert capsys.readouterr().out.count("alike") == 3
+    assert capsys.readouterr().out.count("identical") == 3
     assert json.loads(record.read_text())["different"] == {}
 
 
@@ -279,7 +375,7 @@ def test_the_newest_version_that_is_not_known_to_work_is_refused(monkeypatch):
 
 def test_a_second_opencv_is_found(monkeypatch):
     monkeypatch.setattr(doctor, "OTHER_OPENCVS", ("numpy",))
-    with pytest.raises(doctor.FaultError, match="numpy installed as well") as caught:
+    with pytest.raises(doctor.FaultError, match="numpy is installed too") as caught:
         doctor.check_single_opencv()
     assert "pip uninstall -y numpy" in caught.value.remedy
 
@@ -315,8 +411,8 @@ def test_a_kernel_cache_that_cannot_be_written_is_found(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize(("error", "code", "output"), [
     (OSError(24, "Too many open files"), 1,
-     "cannot be loaded (Too many open files); see `ulimit -a`, or install it again."),
-    (KeyboardInterrupt(), 130, "stopped, nothing written."),
+     "cannot be loaded (Too many open files); check `ulimit -a`, or reinstall."),
+    (KeyboardInterrupt(), 130, "stopped, nothing was written."),
 ], ids=["few descriptors", "Ctrl-C"])  # fmt: skip
 def test_what_happens_while_the_commands_are_imported_is_told(monkeypatch, capsys, error, code, output):
     """Both were tracebacks."""

@@ -122,7 +122,7 @@ def test_a_stop_midway_leaves_nothing(tmp_path, stage, stop):
         process.send_signal(stop)
         errors = process.stderr.read()
     assert process.returncode == 130
-    assert errors.endswith("oasis: stopped, nothing written.\n")
+    assert errors.endswith("oasis: stopped, nothing was written.\n")
     assert names(tmp_path) == set()
 
 
@@ -263,7 +263,7 @@ def test_full_memory_is_told_in_one_sentence(avatar_file, tmp_path, monkeypatch,
 
     monkeypatch.setattr(render, "orbit_camera", fail)
     assert main(["render", str(avatar_file), "-o", str(tmp_path / "x.png")]) == 2
-    assert capsys.readouterr().err == "oasis: the memory of cpu is full; give smaller sizes, or fewer at once.\n"
+    assert capsys.readouterr().err == "oasis: the memory of cpu is full; use smaller sizes, or fewer at once.\n"
     assert what_ran_out(MemoryError()) == what_ran_out(torch.OutOfMemoryError("CUDA error: out of memory"))
     assert what_ran_out(RuntimeError("a bug")) is None
 
@@ -271,7 +271,7 @@ def test_full_memory_is_told_in_one_sentence(avatar_file, tmp_path, monkeypatch,
 @pytest.mark.parametrize(
     ("error", "said"),
     [
-        (RuntimeError("blend: CUDA error 719: unspecified launch failure"), "cpu failed in the middle of the work"),
+        (RuntimeError("blend: CUDA error 719: unspecified launch failure"), "cpu failed, nothing was written"),
         (OSError(24, "Too many open files"), "too many files are open"),
         (OSError(36, "File name too long"), "the name of a file is too long"),
         (OSError(28, "No space left on device"), "a disk is full"),

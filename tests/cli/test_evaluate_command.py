@@ -262,7 +262,7 @@ def test_folders_without_pairs_are_refused_in_one_sentence(hands, tmp_path, caps
     (hands / "mine" / "b.png").rename(hands / "mine" / "no_hand_either.png")
     for folder, words in (
         (tmp_path / "none", "found no such folder"), (hands / "mine" / "no_hand.png", "found a file"),
-        (hands / "single", "found none"), (hands, "of no hand are there two photos"),
+        (hands / "single", "found none"), (hands, "no hand has two photos"),
     ):  # fmt: skip
         options = ["--dataset", "same-hand", "--out", str(tmp_path / "found"), "--prior", "none"]
         assert main(["evaluate", str(folder), *options]) == BAD_INPUT
@@ -273,7 +273,7 @@ def test_folders_without_pairs_are_refused_in_one_sentence(hands, tmp_path, caps
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--dataset", "same-hand"], "expected a folder of photos, or one with a subfolder a hand; name it"),
+        (["--dataset", "same-hand"], "expected a folder of photos, or of subfolders, one per hand; name it"),
         (["photos"], "photos: synthetic hands need no folder"),
         (["--people", "0"], "--people: expected 1 or more, got 0"),
         (["--targets", "9"], "--targets: expected 1 to 8, got 9"),
@@ -302,7 +302,7 @@ def test_ctrl_c_keeps_what_is_whole(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(command, "evaluate_people", stopped)
     assert main(["evaluate", "--out", str(tmp_path / "found"), "--prior", "none"]) == INTERRUPTED
-    assert "what is whole stays in" in capsys.readouterr().err
+    assert "finished parts stay in" in capsys.readouterr().err
 
 
 def test_a_machine_without_a_gpu_is_told_so(tmp_path, monkeypatch, capsys):

@@ -86,7 +86,7 @@ def test_ctrl_c_ends_it_after_the_step_and_the_same_command_ends_with_the_same_b
         stop_after_one_step(patch)
         assert main(["pretrain", str(folder), *SMALL]) == INTERRUPTED
     said = capfd.readouterr().err
-    assert "stopping after this step" in said and "the same command goes on" in said
+    assert "stopping after this step" in said and "the same command continues" in said
     assert signal.getsignal(signal.SIGINT) is asked
     assert [json.loads(line)["step"] for line in (folder / METRICS).read_text().splitlines()] == [1]
     assert main(["pretrain", str(folder), *SMALL]) == 0

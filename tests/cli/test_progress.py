@@ -2,16 +2,20 @@
 
 import contextlib
 import io
+import itertools
 import json
 import os
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from rich.console import Console
 
 from oasis_warp.avatar.quality import SurfaceQuality
+from oasis_warp.cli import summary
+from oasis_warp.cli.options import Reconstruct as ReconstructOptions
 from oasis_warp.cli.progress import (
     EDIT_PLAN,
     USUAL_STEPS,
@@ -19,12 +23,13 @@ from oasis_warp.cli.progress import (
     Run,
     Terminal,
     line_progress,
+    plain_console,
     reconstruct_plan,
     show_progress,
     show_run,
 )
 from oasis_warp.cli.record import recorded
-from oasis_warp.cli.report import make_report, print_report, to_json
+from oasis_warp.cli.report import make_report, print_report, print_warnings, to_json
 from oasis_warp.cli.summary import (
     FINGER_COLORS,
     PAPER,
@@ -207,7 +212,7 @@ def test_the_table_says_everything_in_words(scene, made):
     out = io.StringIO()
     print_report(Console(file=out, width=100), make_report([scene[0]], made, ReconstructConfig(), {"fit": 1.234}))
     text = out.getvalue()
-    expected = ("fit", "1.23 s", "total", "likeness to the photo", "30.0 dB", "new_measure", "0.1235")
+    expected = ("fit", "1.23 s", "total", "PSNR to the photo", "30.0 dB", "new_measure", "0.1235")
     for part in ("prior learned", *expected):
         assert part in text
     assert "Warning: the thumb is hidden" in text
@@ -328,6 +333,24 @@ def panels(made, visibility):
     return [sheet[top : top + side, 24 + k * (side + 12) :][:, :side].astype(float) for k in range(4)]
 
 
+def test_words_under_a_panel_end_before_the_next_one(made, monkeypatch):
+    """The legend stood under two panels and ran into the second."""
+    places = []
+    write = summary.write_text
+
+    def measured(sheet, text, x, y, size, color, weight):
+        write(sheet, text, x, y, size, color, weight)
+        left, _, width, _ = cv2.getTextSize(sheet.shape[1::-1], text, (x, y), cv2.FontFace("sans"), size, weight)
+        places.append((y, left, left + width))
+
+    monkeypatch.setattr(summary, "write_text", measured)
+    n = len(made.avatar.hand.template)
+    draw_quality("a hand", made.avatar, SurfaceQuality(torch.ones(n), torch.zeros(n), torch.zeros(n)))
+    for row in {y for y, *_ in places}:
+        ends = [place[1:] for place in places if place[0] == row]
+        assert all(before[1] < after[0] for before, after in itertools.pairwise([*ends, [WIDTH, WIDTH]]))
+
+
 def hue(panel):
     """Mean colour of what is no background, as shares."""
     color = panel[np.ptp(panel, axis=-1) > 12].mean(0)
@@ -347,3 +370,12 @@ def test_the_palm_and_the_back_are_told_apart(made):
     front, behind, *_ = panels(made, palm)
     green = [(np.argmax(panel, -1) == 1).mean() for panel in (front, behind)]
     assert green[0] > 2 * green[1]
+
+
+@pytest.mark.parametrize("quiet", [True, False])
+def test_warnings_are_printed_even_when_quiet(quiet, capsys):
+    with recorded(ReconstructOptions(photos=(), out=Path("out"), quiet=quiet), ["reconstruct"]):
+        print_warnings(plain_console(), ["the thumb is hidden"])
+    captured = capsys.readouterr()
+    said, silent = (captured.err, captured.out) if quiet else (captured.out, captured.err)
+    assert (said, silent) == ("Warning: the thumb is hidden\n", "")

@@ -203,7 +203,7 @@ def test_palm_and_back_become_one_avatar_when_the_user_says_so(
         monkeypatch.setattr(getattr(sys, stream), "isatty", lambda: True, raising=False)
     monkeypatch.setattr(sys.stdin, "readline", lambda: answer, raising=False)
     assert main(["reconstruct", PALM, BACK, "-o", str(tmp_path / "out")]) == 0
-    assert "the palm and the back of a right hand. Are both of one hand" in capsys.readouterr().err
+    assert "the palm and the back of a right hand. Is it one hand" in capsys.readouterr().err
     assert names(tmp_path / "out") == (FILES if is_one else {"02_flat_closed", "03_flat_closed_back"})
 
 
@@ -262,7 +262,7 @@ def test_a_failure_leaves_nothing(pipeline, photo_file, tmp_path):
 def test_an_interrupt_leaves_nothing(pipeline, photo_file, tmp_path, capsys):
     assert main(["reconstruct", photo_file("stop.png"), "-o", str(tmp_path / "out")]) == 130
     assert names(tmp_path) == {"stop.png"}
-    assert capsys.readouterr().err == "oasis: stopped, nothing written.\n"
+    assert capsys.readouterr().err == "oasis: stopped, nothing was written.\n"
 
 
 def test_an_interrupt_keeps_the_photos_that_are_done(pipeline, photo_file, tmp_path, capsys):
@@ -306,11 +306,11 @@ def test_a_full_disk_is_told_and_leaves_nothing(pipeline, drawn, photo_file, tmp
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (["a.png", "b.png", "--same-hand", "--keypoints", "k.json"], "--keypoints: belongs to one photo"),
+        (["a.png", "b.png", "--same-hand", "--keypoints", "k.json"], "--keypoints: works with one photo"),
         (["--same-hand"], "photos: expected at least one"),
         ([], "photos: expected at least one"),
         (["a/x.png", "b/x.jpg"], "would share one output folder"),
-        (["a.png", "b.png", "--keypoints", "k.json"], "--keypoints: belongs to one photo"),
+        (["a.png", "b.png", "--keypoints", "k.json"], "--keypoints: works with one photo"),
         (["a.png", "--size", "8"], "--size 8: expected 64 to 1024"),
         (["a.png", "--steps", "-1"], "--steps -1: expected 0 or more"),
         (["a.png", "--hand", "-1"], "--hand -1: expected 0 or more"),

@@ -173,10 +173,10 @@ def test_what_is_no_camera_is_refused_in_one_sentence(avatar_file, content, expe
     ("arguments", "expected"),
     [
         (["animate", "-o", "x.mp4", "--camera", "avatar.safetensors"], "not a camera"),
-        (["animate", "avatar.safetensors", "avatar.safetensors", "-o", "x.mp4"], "expected one, or two for one scene"),
+        (["animate", "avatar.safetensors", "avatar.safetensors", "-o", "x.mp4"], "expected one or two, got 3"),
         (["render", "-o", "x.bmp"], "ends in .png or .webp"),
         (["render", "-o", "x.jpg", "--background", "transparent"], "JPEG has no transparency"),
-        (["render", "-o", "x.png", "--background", "mauve"], "--background mauve: expected white, black or six hex"),
+        (["render", "-o", "x.png", "--background", "mauve"], "mauve: expected white, black, transparent or six hex"),
         (["render", "-o", "x.png", "--pose", "fits"], "Did you mean 'fist'?"),
         (["render", "-o", "x.png", "--pose", "none.json"], "none.json: cannot be read"),
         (["render", "-o", "x.png", "--size", "0"], "--size 0: expected 16 to"),
@@ -192,6 +192,7 @@ def test_what_is_no_camera_is_refused_in_one_sentence(avatar_file, content, expe
         (["animate", "-o", "x.mp4", "--seconds", "nan"], "--seconds nan: expected 1 to"),
         (["animate", "-o", "x.mp4", "--motion", "poses", "--poses", "fist,frog"], "got frog"),
         (["animate", "-o", "x.mp4", "--motion", "poses", "--poses", ","], "got none"),
+        (["animate", "-o", "x.mp4", "--motion", "pose"], "expected turntable, poses or a motion file. Did you mean 'p"),
         (["animate", "-o", "x.mp4", "--background", "transparent"], "has no transparency; write .webp"),
     ],
 )

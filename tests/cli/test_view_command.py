@@ -262,8 +262,8 @@ def test_strangers_and_other_sites_get_nothing(form_server):
     [
         ("script.py", {}, 422, "script.py: expected a picture, .jpg"),
         ("", {}, 422, "expected a picture"),
-        ("a.jpg", {"Content_Length": str(MAX_BYTES + 1)}, 413, "more than 64 MB"),
-        ("a.jpg", {"Content_Length": "9" * 5000}, 413, "more than 64 MB"),
+        ("a.jpg", {"Content_Length": str(MAX_BYTES + 1)}, 413, "larger than 64 MB"),
+        ("a.jpg", {"Content_Length": "9" * 5000}, 413, "larger than 64 MB"),
         ("a.jpg", {"Content_Length": "-1"}, 411, ""),
     ],
 )
@@ -320,7 +320,7 @@ def test_a_photo_that_takes_too_long_is_ended(program, tmp_path, monkeypatch):
         time.sleep(0.02)
     jobs.stop()
     worker.join()
-    assert look(jobs, job).note.startswith("It took more than")
+    assert look(jobs, job).note.startswith("It took longer than")
 
 
 def test_the_command_serves_until_ctrl_c_and_refuses_a_file_for_a_folder(tmp_path, monkeypatch, capsys):
@@ -329,7 +329,7 @@ def test_the_command_serves_until_ctrl_c_and_refuses_a_file_for_a_folder(tmp_pat
 
     monkeypatch.setattr(FormServer, "serve_forever", stop)
     assert main(["serve", "--folder", str(tmp_path / "served"), "--no-browser"]) == 0
-    assert "Photos are taken at http://127.0.0.1:" in capsys.readouterr().out
+    assert "The form is at http://127.0.0.1:" in capsys.readouterr().out
     (tmp_path / "file").write_text("")
     assert main(["serve", "--folder", str(tmp_path / "file"), "--no-browser"]) == 2
     assert "file: cannot be made" in capsys.readouterr().err

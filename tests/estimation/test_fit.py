@@ -213,7 +213,7 @@ def test_a_pose_beyond_its_limits_costs_alike_on_both_sides(kinematics, beyond):
         assert cost(angles) == pytest.approx((0.1 / fitter.settings.limit) ** 2, rel=1e-3)
 
 
-CUT = "the hand is cut by the photo's border: what lies outside is guessed"
+CUT = "the photo's border cuts the hand: the part outside is guessed"
 FRAME = 401, 301
 FINGERS = [[150.0 + 25 * finger, 200.0 - 35 * bone] for finger in range(5) for bone in range(4)]
 FLAT = np.array([[200.0, 270.0], *FINGERS])

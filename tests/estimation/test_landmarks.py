@@ -251,7 +251,7 @@ def test_a_pose_elsewhere_is_warned_about(fitted, tmp_path):
     data = pose_data(fit)
     data["translation"][0] += 0.04
     read = read_keypoints(write(tmp_path / "k.json", data), photo)
-    assert any("outline badly" in warning for warning in read.warnings)
+    assert any("does not match the hand's outline" in warning for warning in read.warnings)
 
 
 @pytest.mark.parametrize(

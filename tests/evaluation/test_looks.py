@@ -383,9 +383,9 @@ def weights_of(hand, tmp_path):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--dataset", "hanco"], "expected its folder, --root, and a learned prior"),
-        (["--dataset", "hanco", "--root", "x", "--prior", "none"], "expected its folder, --root, and a learned prior"),
-        (["--root", "x"], "--root: is for interhand, hanco"),
+        (["--dataset", "hanco"], "expected --root FOLDER and a learned prior"),
+        (["--dataset", "hanco", "--root", "x", "--prior", "none"], "expected --root FOLDER and a learned prior"),
+        (["--root", "x"], "--root: works only with interhand, hanco"),
         (["folder", "--dataset", "hanco", "--root", "x"], "a data set has --root"),
         (["--dataset", "hanco", "--root", "x", "--targets", "0"], "--targets"),
     ],

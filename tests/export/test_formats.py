@@ -92,7 +92,7 @@ def test_a_page_has_the_photo_beside_the_hand_and_other_formats_refuse_it(left_h
     for name, code in (("hand.html", 0), ("hand.ply", 2)):
         given = ["-o", str(tmp_path / name), "--photo", str(tmp_path / "photo.png")]
         assert main(["export", str(tmp_path / "avatar.safetensors"), *given]) == code
-    assert "hand.ply: has no room for --photo" in capsys.readouterr().err
+    assert "hand.ply: cannot hold --photo" in capsys.readouterr().err
     assert '<img id="photo"' in (tmp_path / "hand.html").read_text()
 
 

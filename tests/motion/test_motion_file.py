@@ -363,7 +363,7 @@ def seen_in(monkeypatch, avatar, lost):
 def test_frames_without_the_hand_are_bridged_and_said(film, avatars, monkeypatch, caplog):
     motion, focals = seen_in(monkeypatch, avatars["left"], {0, 4, 5, 11})
     found = read_motion(film, avatars["left"])
-    assert "no left hand in frames 1, 5 to 6, 12 of 12; bridged" in caplog.text
+    assert "no left hand in frames 1, 5 to 6, 12 of 12; interpolated" in caplog.text
     assert found.fps == pytest.approx(12)
     seen = [1, 2, 3, 6, 7, 8, 9, 10]
     assert torch.allclose(found.angles[seen], motion.angles[seen], atol=1e-6)

@@ -334,7 +334,7 @@ def whole_numbers(tensors):
         (half_a_version, None, "damaged, its header has no valid version"),
         (long_name, None, "trained for the hand model"),
         (None, whole_numbers, "vertex_head.last.bias holds torch.int32 instead of real numbers"),
-        (newer, None, "a network of version 2, but 1 is the last known here; update oasis-warp."),
+        (newer, None, "a network of version 2, newer than the known 1; update oasis-warp."),
         (nameless, None, "damaged, its header has no valid hand_model; copy it again."),
         (unknown_switch, None, "its header describes no network known here .*magic"),
         (other_hand, None, r"trained for the hand model 'mano' \(778 vertices, .*'bundled' \(12337"),
@@ -378,7 +378,7 @@ def test_what_is_no_weights_file_is_refused(stored, tmp_path, hand):
         load_network(cut, hand)
     other = tmp_path / "other.safetensors"
     save_file({"a": torch.zeros(1)}, other)
-    with pytest.raises(InputError, match="a safetensors file, but no network of ours"):
+    with pytest.raises(InputError, match="a safetensors file, but not a network"):
         load_network(other, hand)
 
 

@@ -242,10 +242,10 @@ def test_a_network_of_another_hand_is_refused(weights, tmp_path, monkeypatch, ha
 
 
 def test_weights_of_a_backbone_that_nobody_reads_are_refused(weights, tmp_path):
-    with pytest.raises(InputError, match=r"network.safetensors: reads photos with an encoder of its own"):
+    with pytest.raises(InputError, match=r"network.safetensors: does not use backbone weights"):
         choose_prior(weights, tmp_path / "model.safetensors")
     for word in ("learned", "none"):
-        with pytest.raises(InputError, match=f"the prior '{word}' has no use for a backbone's weights"):
+        with pytest.raises(InputError, match=f"the prior '{word}': does not use backbone weights"):
             choose_prior(word, tmp_path / "model.safetensors")
 
 

@@ -41,7 +41,7 @@ def test_nothing_is_built_unasked(cache):
 def test_without_a_compiler_a_sentence_says_so_and_python_goes_on(cache, monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
     monkeypatch.setenv(picture_extension.VARIABLE, "1")
-    with pytest.warns(RuntimeWarning, match=r"^The C\+\+ node of pictures cannot be used \(.*no-such-compiler.*\); "):
+    with pytest.warns(RuntimeWarning, match=r"^The C\+\+ node for rasterization cannot be used \(.*no-such-compiler"):
         assert picture_extension.loaded() is None
     assert not list(cache.iterdir())
 
@@ -53,7 +53,7 @@ def test_a_value_of_the_variable_that_means_nothing_is_refused(cache, monkeypatc
 
 
 def test_the_doctor_says_whether_it_is_there_and_why_it_cannot_be(cache, monkeypatch):
-    assert doctor.check_extension(build=False).startswith("not built; Python does its work")
+    assert doctor.check_extension(build=False).startswith("not built (optional)")
     monkeypatch.setenv("CXX", "no-such-compiler")
     with pytest.raises(doctor.FaultError, match="could not be built: .*no-such-compiler"):
         doctor.check_extension(build=True)

@@ -215,7 +215,7 @@ def test_values_that_are_not_finite_are_refused_by_name(name, value, place, dtyp
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
-        ("quats", 0.0, "quats: expected rows that are not zero, got 1 zero rows"),
+        ("quats", 0.0, "quats: expected nonzero rows, got 1 zero rows"),
         ("opacities", 1.25, "opacities: expected values in .0, 1., got 0.* to 1.25"),
         ("opacities", -0.5, "opacities: expected values in .0, 1., got -0.5 to"),
     ],

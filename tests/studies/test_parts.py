@@ -118,7 +118,7 @@ def test_variants_are_trained_on_the_same_batches_until_time_is_up_and_then_eval
     )  # fmt: skip
     assert network_parts.run(replace(options, only=("vet_off",))) == []
     assert network_parts.run(replace(options, minutes=0)) == []
-    assert "the same command goes on" in capsys.readouterr().err and len(met) == 3
+    assert "the same command continues" in capsys.readouterr().err and len(met) == 3
     rows = network_parts.run(options)
     assert len(met) == 4 and torch.equal(met[0], met[2]) and torch.equal(met[1], met[3])
     kinds = dict.fromkeys((row["light"], row["colors"]) for row in rows)

@@ -179,4 +179,4 @@ def test_ctrl_c_keeps_what_is_whole_and_says_so(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr("oasis_warp.cli.synthesize.write_shards", stopped)
     assert cli.main(["synthesize", str(tmp_path / "out")]) == INTERRUPTED
-    assert "the same command goes on" in capsys.readouterr().err
+    assert "the same command continues" in capsys.readouterr().err

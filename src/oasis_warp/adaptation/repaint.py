@@ -72,8 +72,8 @@ def match_size(photo: Photo, width: int, height: int, name: str) -> Float[Tensor
     rows, columns = photo.rgb.shape[:2]
     if abs(columns * height / rows - width) > ASPECT_PIXELS and abs(rows * width / columns - height) > ASPECT_PIXELS:
         raise InputError(
-            f"{name}: {width} x {height} pixels are no scaled copy of {photo.name} with {columns} x {rows}; paint on "
-            "the whole photo, without cutting or turning it."
+            f"{name}: {width} x {height} pixels do not have the proportions of {photo.name}, {columns} x {rows}; "
+            "paint on the whole photo, without cropping or rotating it."
         )
     return _scaled(photo.rgb.float() / 255, width, height)
 

@@ -127,7 +127,7 @@ def coverage_warnings(found: dict[str, float]) -> list[str]:
     if found["seen_percent"] >= LITTLE_SEEN:
         return []
     percent = f"{found['seen_percent']:.0f} %"
-    return [f"little was seen: the photo shows {percent} of the hand from the front, the rest is guessed"]
+    return [f"little was seen: the photo shows {percent} of the hand's surface, the rest is guessed"]
 
 
 @torch.no_grad()
@@ -141,19 +141,19 @@ def photo_warnings(image: Float[Tensor, "S S 3"], mask: Float[Tensor, "S S"], si
     """
     inside = inner_mask(mask) > 0.5
     if not bool(inside.any()):
-        return ["the hand is thinner than a few pixels: its colours hold the background"]
+        return ["the hand is only a few pixels wide: its colours are mixed with the background"]
     pixels, notes = image[inside], []
     red, green, blue = pixels.mean(0).tolist()
     brightness = red * LUMA[0] + green * LUMA[1] + blue * LUMA[2]
     clipped = float((pixels.amax(1) > CLIP).float().mean())
     if brightness < DARK:
-        notes.append(f"dark photo: the hand has {100 * brightness:.0f} % of full brightness, its colours are noise")
+        notes.append(f"dark photo: the hand has {100 * brightness:.0f} % of full brightness, its colours are noisy")
     if clipped > CLIPPED:
-        notes.append(f"over-exposed photo: {100 * clipped:.0f} % of the hand is white or nearly so and has no detail")
+        notes.append(f"over-exposed photo: {100 * clipped:.0f} % of the hand is almost white and has no detail")
     if red < SKIN_REDNESS * max(green, blue):
-        notes.append("the hand does not have the colour of skin: coloured light or a glove; all of it counts as skin")
+        notes.append("the hand does not have the colour of skin: coloured light, or a glove, which is treated as skin")
     if (found := _blur(image, mask, side)) > BLURRED:
-        notes.append(f"blurred photo: the avatar will be, too (blur {found:.2f}, sharp photos have less than .65)")
+        notes.append(f"blurred photo: the avatar will be blurred too (blur {found:.2f}, in sharp photos below 0.65)")
     return notes
 
 

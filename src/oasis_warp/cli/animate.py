@@ -14,7 +14,7 @@ from oasis_warp.cli.record import written
 from oasis_warp.cli.render import check_numbers, choose_pose, load_avatar, read_color, straight_alpha
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import BLACK
-from oasis_warp.core.errors import InputError
+from oasis_warp.core.errors import InputError, did_you_mean
 from oasis_warp.core.logging import Progress
 from oasis_warp.core.processes import single_threaded_math
 from oasis_warp.core.types import Camera, Color, Gaussians, HandPose
@@ -26,6 +26,7 @@ from oasis_warp.motion import read_motion, resample
 from oasis_warp.render import render
 
 MAX_FRAMES = 10_000
+MOTIONS = ("turntable", "poses")
 MAX_LOOPS = 65_535
 """What a GIF can count to."""
 MAX_FRAMED = 60
@@ -124,14 +125,14 @@ def run(options: Animate) -> int:
     check_video(options.out, transparent=transparent)
     background = None if transparent else read_color(options.background)
     if not 0 <= options.loop <= MAX_LOOPS:
-        raise InputError(f"--loop {options.loop}: expected 0, for ever, to {MAX_LOOPS}; choose another number.")
+        raise InputError(f"--loop {options.loop}: expected 0 (forever) to {MAX_LOOPS}; choose another number.")
     if not 1 <= len(options.avatars) <= 2:
-        raise InputError(f"avatars: expected one, or two for one scene, got {len(options.avatars)}; change them.")
+        raise InputError(f"avatars: expected one or two, got {len(options.avatars)}; name them after `oasis animate`.")
     n_frames = count_frames(options.seconds, options.fps)
     names = read_names(options.poses)
     path = None if options.camera is None else read_cameras(options.camera)
     if path is not None and options.motion == "turntable":
-        raise InputError("--camera: belongs to a moving hand, a turntable turns its own; choose another --motion.")
+        raise InputError("--camera: does not work with --motion turntable; choose another motion.")
     avatars = [load_avatar(options, file) for file in options.avatars]
     with show_progress(Terminal()) as progress:
         hands = [(avatar, _poses(avatar, options, n_frames, names, progress)) for avatar in avatars]
@@ -157,12 +158,15 @@ def _poses(avatar: Avatar, options: Animate, n_frames: int, names: list[str], pr
     if not isinstance(options.motion, Path):
         angles = pose_sequence(avatar.hand, names, max(1, round(n_frames / len(names))), avatar.rest)
         return [avatar.source_pose._replace(angles=each) for each in angles]
+    if not options.motion.suffix:
+        hint = did_you_mean(str(options.motion), MOTIONS) or "Choose one."
+        raise InputError(f"--motion {options.motion}: expected {', '.join(MOTIONS)} or a motion file. {hint}")
     motion = resample(read_motion(options.motion, avatar, progress=progress), options.fps)
     count_frames(len(motion.angles) / options.fps, options.fps)
     if options.wrist == "still":
         return motion.poses(avatar.source_pose)
     if motion.orientations is None or motion.translations is None:
-        raise InputError(f"{options.motion}: says nothing of the wrist's place; leave out --wrist moves.")
+        raise InputError(f"{options.motion}: contains no wrist positions; leave out --wrist moves.")
     return [HandPose(*(part.to(avatar.shape) for part in each)) for each in
             zip(motion.angles, motion.orientations, motion.translations, strict=True)]  # fmt: skip
 
@@ -208,5 +212,5 @@ def read_names(text: str) -> list[str]:
     unknown = [name for name in names if name not in POSE_NAMES]
     if unknown or not names:
         got = ", ".join(unknown) or "none"
-        raise InputError(f"--poses {text}: expected names out of {', '.join(POSE_NAMES)}, got {got}; choose others.")
+        raise InputError(f"--poses {text}: expected names from {', '.join(POSE_NAMES)}, got {got}; choose others.")
     return names

@@ -1,20 +1,24 @@
 """The command line, `oasis`: read it, run the command, turn what goes wrong into one sentence and an exit code."""
 
+import contextlib
+import dataclasses
 import importlib
 import io
 import logging
 import os
 import signal
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Sequence
-from typing import Annotated, Any, NoReturn, get_args
+from typing import Annotated, Any, NoReturn, Union, get_args
 
 import tyro
 
 from oasis_warp import __version__
 from oasis_warp.cli import developer_options, options
+from oasis_warp.cli.command_line import explain
 from oasis_warp.cli.progress import BAD_INPUT, INTERRUPTED
 from oasis_warp.cli.record import recorded, write_record
 from oasis_warp.core.errors import InputError, did_you_mean, one_line, shortened
@@ -39,17 +43,18 @@ Command = (
     | Annotated[developer_options.Doctor, tyro.conf.subcommand("doctor")]
 )
 
+STOPPED = "stopped, nothing was written."
 OWN_JSON = (options.Info, developer_options.Gradcheck)
 """Commands whose --json holds what they found."""
 SHORTAGES = {
-    "the memory of {device} is full; give smaller sizes, or fewer at once.": (
+    "the memory of {device} is full; use smaller sizes, or fewer at once.": (
         "MemoryError", "OutOfMemory", "out of memory", "can't allocate memory", "Cannot allocate memory",
         "Insufficient memory", "Failed to allocate", "failed to map segment", "bad allocation", "bad_alloc",
     ),
-    "too many files are open; allow this process more of them (`ulimit -n 1024`).": ("Too many open files",),
-    "a disk is full; free some room on it, also where temporary files lie.": ("No space left on device",),
+    "too many files are open; raise the limit (`ulimit -n 1024`).": ("Too many open files",),
+    "a disk is full; free some space, also in the folder of temporary files.": ("No space left on device",),
     "the name of a file is too long for this disk; choose a shorter one.": ("File name too long",),
-    "{device} failed in the middle of the work, nothing written; see what `oasis doctor` says.": ("CUDA error",),
+    "{device} failed, nothing was written; run `oasis doctor`.": ("CUDA error",),
 }  # fmt: skip
 """Sentences, and what the system or packages say instead; the first counts, as CUDA calls full memory an error too."""
 COMMANDS = tuple(get_args(command)[1].name for command in get_args(Command))
@@ -64,56 +69,100 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
         _refuse_command(arguments[0])
-    chosen = tyro.cli(
-        Command,
-        prog="oasis",
-        description=f"One photo of a hand in, an animatable 3D Gaussian avatar out. oasis_warp {__version__}, as "
-        "`oasis --version` says. `oasis COMMAND --help` explains a command.",
-        args=arguments,
-        config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
-    )
+    chosen = _parse(arguments)
     logging.basicConfig(format="oasis: %(message)s")
     verbose = getattr(chosen, "verbose", False)
     logging.getLogger("oasis_warp").setLevel(logging.INFO if verbose else logging.WARNING)
     # A batch system's SIGTERM ends the work as Ctrl-C does: what is half-written is taken away.
-    before, start = signal.signal(signal.SIGTERM, signal.default_int_handler), time.monotonic()
+    interrupted = threading.Event()
+
+    def interrupt(number: int, frame: Any) -> NoReturn:
+        interrupted.set()
+        signal.default_int_handler(number, frame)
+
+    before, start = {signal.SIGTERM: signal.signal(signal.SIGTERM, interrupt)}, time.monotonic()
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else whoever started this ignores it
+        before[signal.SIGINT] = signal.signal(signal.SIGINT, interrupt)
     try:
         with recorded(chosen, arguments) as record:
-            code, message = _run(chosen, verbose)
+            code, message = _run(chosen, verbose, interrupted)
             if getattr(chosen, "json", None) is not None and not isinstance(chosen, OWN_JSON):
                 write_record(chosen, record, code, message, start)
     except InputError as error:  # of the record
         code, message = BAD_INPUT, str(error)
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
     if message is not None:
         print(f"oasis: {message}", file=sys.stderr)
     return code
 
 
-def _run(chosen: Any, verbose: bool) -> tuple[int, str | None]:
-    """Run a command; its exit code, and a sentence about what went wrong."""
+def _run(chosen: Any, verbose: bool, interrupted: threading.Event) -> tuple[int, str | None]:
+    """Run a command; its exit code, and a sentence about what went wrong.
+
+    Libraries of compiled code may turn Ctrl-C into another error, so every error after it counts as an interrupt.
+    """
     try:
         # The command's module imports torch and Warp, which take seconds: only now.
         command = importlib.import_module(f"oasis_warp.cli.{type(chosen).__name__.lower()}")
         return command.run(chosen), None
-    except InputError as error:
-        if verbose:
-            traceback.print_exc()
-        return BAD_INPUT, str(error)
     except KeyboardInterrupt:
-        return INTERRUPTED, "stopped, nothing written."
+        return INTERRUPTED, STOPPED
     except Exception as error:
+        if interrupted.is_set():
+            return INTERRUPTED, STOPPED
+        if isinstance(error, InputError):
+            if verbose:
+                traceback.print_exc()
+            return BAD_INPUT, str(error)
         if (message := what_ran_out(error)) is None:
             raise
         return BAD_INPUT, message.format(device=getattr(chosen, "device", "cpu"))
 
 
+def _parse(arguments: Sequence[str]) -> Any:
+    """The options of the command; exits after help, and with one sentence after a wrong command line."""
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(
+                _overview() if arguments in (["--help"], ["-h"]) else Command,
+                prog="oasis",
+                description="One photo of a hand in, an animatable 3D Gaussian avatar out. Version "
+                f"{__version__} (`oasis --version`). `oasis COMMAND --help` explains a command.",
+                args=arguments,
+                config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+            )
+    except SystemExit as stopped:
+        if not stopped.code:
+            raise
+        print(f"oasis: {_explain(said.getvalue(), arguments)}", file=sys.stderr)
+        raise SystemExit(BAD_INPUT) from None
+
+
+def _explain(said: str, arguments: Sequence[str]) -> str:
+    """One sentence about a wrong command line, from what tyro says about it."""
+    kinds = {name.name: kind for kind, name in map(get_args, get_args(Command))}
+    if not arguments or arguments[0] not in kinds:
+        return explain(said, arguments, "oasis")
+    parts = dataclasses.fields(kinds[arguments[0]])
+    return explain(said, arguments, f"oasis {arguments[0]}", [f"--{part.name.replace('_', '-')}" for part in parts])
+
+
+def _overview() -> Any:
+    """`Command` with one line of help per command."""
+    pairs = [get_args(command) for command in get_args(Command)]
+    first = {named.name: (kind.__doc__ or "").split("\n\n")[0] for kind, named in pairs}
+    short = [Annotated[kind, tyro.conf.subcommand(name.name, description=first[name.name])] for kind, name in pairs]
+    return Union[tuple(short)]  # noqa: UP007 - a list of types
+
+
 def _refuse_command(name: str) -> NoReturn:
-    """Say which command was meant, or which there are, and exit as after other wrong command lines."""
+    """Suggest the nearest command, or list all, and exit as after other wrong command lines."""
     hint = did_you_mean(name, COMMANDS).replace("Did", "did")
     answer = hint or f"expected one of {', '.join(COMMANDS)}."
-    print(f"oasis: {one_line(shortened(name))!r} is no command; {answer}", file=sys.stderr)
+    print(f"oasis: {one_line(shortened(name))!r} is not a command; {answer}", file=sys.stderr)
     raise SystemExit(BAD_INPUT)
 
 

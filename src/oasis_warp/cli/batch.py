@@ -52,7 +52,7 @@ def open_cluster(workers: int | None, scheduler: str | None, device: str) -> Ite
         InputError: both or nonsense is asked for, Dask is missing, no scheduler answers, or it is lost.
     """
     if workers is not None and scheduler is not None:
-        raise InputError("--workers: belongs to this machine, --scheduler to a cluster; give one of the two.")
+        raise InputError("--workers and --scheduler exclude each other; give only one of them.")
     if workers is not None and workers < 1:
         raise InputError(f"--workers {workers}: expected 1 or more; leave it out for all cores.")
     try:
@@ -72,7 +72,7 @@ def open_cluster(workers: int | None, scheduler: str | None, device: str) -> Ite
         client = distributed.Client(scheduler, timeout=PATIENCE, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"--scheduler {scheduler}: none answers there ({error}); start one with `dask scheduler`."
+            f"--scheduler {scheduler}: no scheduler answers there ({error}); start one with `dask scheduler`."
         ) from error
     with client:
         try:
@@ -151,7 +151,7 @@ def work(client: Any, tasks: Sequence[Sequence[str]], order: Order, report: Call
                 done.add(future)
     except (CancelledError, OSError) as error:
         raise InputError(
-            "oasis batch: the scheduler is lost; start it and its workers again, and the same command goes on."
+            "oasis batch: the scheduler is lost; restart it and its workers, and the same command continues."
         ) from error
     return worked
 
@@ -196,7 +196,7 @@ def run(options: Batch) -> int:
             with show_run(Terminal(), run) as shown:
                 worked = work(client, tasks, order, lambda made, kept: _count(run, shown.progress, made, kept))
         except KeyboardInterrupt:
-            print(f"oasis: stopped; {run.what} are done, the same command goes on.", file=sys.stderr)
+            print(f"oasis: stopped; {run.what} are done, the same command continues.", file=sys.stderr)
             return INTERRUPTED
         seconds = time.monotonic() - start
     summary = finish(order, tasks)
@@ -204,7 +204,7 @@ def run(options: Batch) -> int:
     summary["command"] = exact_command()
     write_file(order.out / "summary.json", (json.dumps(summary, indent=1) + "\n").encode())
     plain_console().print(_table(summary))
-    print(f"written: {options.out}{os.sep}; manifest.jsonl there says which photo is where.")
+    print(f"written: {options.out}{os.sep}; manifest.jsonl there lists the folder of each photo.")
     return BAD_INPUT if summary["photos"]["failed"] else 0
 
 

@@ -45,7 +45,7 @@ def run(options: Compare) -> int:
     names = [path.parent.name or path.stem for path in (options.one, options.other)]
     sheet, likeness = draw_comparison(*avatars, names)
     for (pose, azimuth), psnr in zip(VIEWS, likeness, strict=True):
-        table.add_row(f"likeness of {_view(pose, azimuth)}", "", "alike" if psnr == math.inf else f"{psnr:.1f} dB")
+        table.add_row(f"PSNR, {_view(pose, azimuth)}", "", "identical" if psnr == math.inf else f"{psnr:.1f} dB")
     print_tables([table], 80)
     note(different={name: values for name, _, *values in different}, likeness_db=likeness)
     if options.out is not None:
@@ -97,7 +97,7 @@ def draw_comparison(one: Avatar, other: Avatar, names: list[str]) -> tuple[torch
         error = float((drawn[0] - drawn[1]).square().mean())
         likeness.append(-10 * math.log10(error) if error else math.inf)
         apart = 0.5 + MAGNIFIED * (drawn[1] - drawn[0]) / 2
-        captions = [f"{name}, {_view(pose, azimuth)}" for name in names] + [f"second minus first, {MAGNIFIED:g} x"]
+        captions = [f"{name}, {_view(pose, azimuth)}" for name in names] + [f"second minus first, {MAGNIFIED:g} times"]
         for row, picture, caption in zip(rows, (*drawn, apart), captions, strict=True):
             row.append(Panel(to_uint8(picture).numpy(), caption))
     return torch.from_numpy(make_sheet("Comparison", " and ".join(names), rows, WIDTH)), likeness

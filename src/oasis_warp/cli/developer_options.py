@@ -6,16 +6,16 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg, subcommand
 
-from oasis_warp.cli.options import AllowDownload, Device, JsonFile, LpipsWeights, OutputFolder, command
+from oasis_warp.cli.options import AllowDownload, Device, JsonFile, LpipsWeights, OutputFolder, command, plain_help
 
 BackboneWeights = Annotated[
-    Path | None, arg(help="DINOv2's model.safetensors, for a network of your own in the paper's profile.")
+    Path | None, arg(help="DINOv2's model.safetensors, for your own network with the paper's profile.")
 ]
 Selection = Annotated[
     Path | None,
-    arg(help="For interhand: a JSON file with the captures and sequences to take, where they are not the paper's."),
+    arg(help="For interhand: JSON file with the captures and sequences to use instead of the paper's."),
 ]
-CsvFile = Annotated[Path | None, arg(help="The same as a table.")]
+CsvFile = Annotated[Path | None, arg(help="CSV file to write the table to.")]
 Threads = Annotated[int, arg(help="CPU threads.")]
 FamilyName = Literal[
     "rasterization", "depth_map", "depth_visibility", "face_rotations", "pose_on_mesh", "pose_on_mesh_covars", "skin"
@@ -25,110 +25,110 @@ Kind = Literal["freckles", "hair", "polish", "tattoo", "ring", "plaster"]
 
 @command
 class Gradcheck:
-    """Certify the operators on this machine: values, gradients and bits, against finite differences and float64 twins.
+    """Certify the operators on this machine: values, gradients and reproducible bits.
 
-    Without --scenes everything is measured on a few hundred scenes, in about a minute. The exit code is 0 when every
-    error is within its bound, 1 when one is not.
+    They are compared with finite differences and float64 references on a few hundred scenes, in about a minute. The
+    exit code is 0 if every error is within its bound, else 1.
     """
 
     scenes: int | None = None
-    """Check this many seeded scenes against the twins instead, spread over the operators."""
+    """Only compare with the float64 references, on this many random scenes over all operators."""
     family: FamilyName | None = None
-    """Only this operator."""
+    """Check only this operator."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where the operators run; the twins run on the CPU."""
+    """Device of the operators; the references run on the CPU."""
     seed: int = 0
-    """First seed of the scenes; a failure names the seed to give here."""
+    """First seed of the scenes. A failure names its seed, which reproduces it here."""
     jobs: int | None = None
-    """Processes for --scenes; as many as there are cores when not given, one for CUDA."""
+    """Processes for --scenes. Default: one per core; one for CUDA."""
     json: Path | None = None
-    """File for all that was measured."""
+    """JSON file to write all measurements to."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@plain_help
 class ErrorTime:
-    """What each threshold and option of the operators costs and buys: error_time.csv, .json and a plot an operator.
+    """Error against run time of each threshold and option: error_time.csv, .json and a plot per operator.
 
-    Every knob is turned alone, on the bundled hand and on scenes that are hard to compute. Errors are those against
-    the float64 kernels with the default rules; times are medians of calls timed in turns.
+    Options are varied one at a time, on the bundled hand and on difficult scenes. Errors are relative to the float64
+    kernels with default settings. Times are medians of interleaved calls.
     """
 
     out: OutputFolder
     quick: bool = False
-    """The bundled hand only, and few repeats: for a look, not for a verdict."""
+    """Only the bundled hand, and few repeats: a first impression."""
     repeats: int | None = None
-    """Timed calls of each setting: 20 when not given, 5 with --quick."""
+    """Timed calls per setting. Default: 20; 5 with --quick."""
     size: int = 256
-    """Side of the pictures of the hand [px]; a multiple of 4."""
+    """Side of the hand's pictures [px], a multiple of 4."""
     seed: int = 0
-    """Seed of the scenes and the gradients' weights."""
+    """Seed of the scenes and of the loss weights."""
     device: Device = "cpu"
     threads: int = 1
-    """CPU threads of the default setting; the knob "threads" tries other numbers up to that of the cores."""
+    """CPU threads of the default setting; the option "threads" is varied up to the number of cores."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@plain_help
 class Kernels:
-    """How fast everything is, and how exact, in one run.
+    """Speed and error of all operators in one run.
 
-    On the CPU every operator, beside the same in torch and a scalar kernel. On CUDA pictures of several sizes, posing,
-    visibility, an avatar's frame and a step of learning, on the host's clock and in CUDA graphs.
+    CPU: every operator, compared with torch and with a scalar kernel. CUDA: pictures of several sizes, posing,
+    visibility, an avatar's frame and a training step, launched from the host and in CUDA graphs.
     """
 
     json: JsonFile = None
     csv: CsvFile = None
     plot: Path | None = None
-    """Picture of the times: .png or .svg; needs matplotlib."""
+    """Plot of the times, .png or .svg; needs matplotlib."""
     only: str = ""
-    """Measure only what holds this text in its name: an operator on the CPU, a case or pass on CUDA."""
+    """Measure only names that contain this text: operators on the CPU, cases or passes on CUDA."""
     repeats: int | None = None
-    """Timed calls of each on the CPU, 30 when not given; on CUDA groups of calls, 11 when not given."""
+    """Timed calls on the CPU (default 30), or groups of calls on CUDA (default 11)."""
     size: int | None = None
-    """Side of the picture [px], 256 when not given; on CUDA every case has its own."""
+    """Side of the picture on the CPU [px] (default 256); CUDA cases have their own."""
     gaussians: int | None = None
-    """Gaussians drawn of the bundled hand's 36,881, 20,000 when not given; on CUDA every case has its own."""
+    """Gaussians of the bundled hand on the CPU, up to 36,881 (default 20,000); CUDA cases have their own."""
     device: Device = "cpu"
     threads: Threads = 1
     peer: Literal["gsplat"] | None = None
-    """Time another rasterizer too, in turns with ours; on CUDA only."""
+    """Also time another rasterizer, interleaved with ours; CUDA only."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@plain_help
 class Scaling:
-    """How time and memory grow with Gaussians, pixels and views: scaling.csv, .json and a plot.
+    """Growth of time and memory with Gaussians, pixels and views: scaling.csv, .json and a plot.
 
-    1,000 to 10 million Gaussians, 128 to 4096 pixels a side, 1 to 64 views, and two scenes that load a rasterizer most.
-    Every picture is compared with the float64 kernels, all of it or, where that would take long, a part.
+    The scenes have 1,000 to 10 million Gaussians, 128 to 4096 pixels a side and 1 to 64 views; two are worst cases.
+    Every picture is compared with the float64 kernels, large ones in part.
     """
 
     out: OutputFolder
     quick: bool = False
-    """Small scenes only, in a minute on a CPU."""
+    """Only small scenes: a minute on a CPU."""
     seconds: float | None = None
-    """For timing each point: 2 when not given, 1 with --quick."""
+    """Seconds of timing per point. Default: 2; 1 with --quick."""
     seed: int = 0
     """Seed of the scenes."""
     device: Device = "cpu"
     threads: Threads = 1
 
 
-@dataclass(frozen=True, kw_only=True)
+@plain_help
 class Roofline:
-    """How near each CUDA kernel comes to what the GPU can do, which is measured first."""
+    """Share of the GPU's measured peak that each CUDA kernel reaches."""
 
     json: JsonFile = None
     csv: CsvFile = None
     plot: Path | None = None
-    """Picture: .png or .svg; needs matplotlib."""
+    """Plot, .png or .svg; needs matplotlib."""
     seed: int = 0
     """Seed of the scenes."""
     device: Literal["cuda"] = "cuda"
-    """Where to compute."""
+    """Device that computes."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:
-    """Measure the operators on this machine: speed, error against run time, growth, or share of what is possible."""
+    """Measure the operators on this machine: speed, error against run time, scaling, or share of the GPU's peak."""
 
     what: (
         Annotated[Kernels, subcommand("kernels")]
@@ -140,34 +140,34 @@ class Bench:
 
 @command
 class Doctor:
-    """Check that everything is there and computes what it should; each failing line says what to do."""
+    """Check the installation and run one kernel; each failed check says what to do."""
 
     build_extension: bool = False
-    """Also compile the C++ node that draws on CUDA with less time on the host; needs a compiler and ninja."""
+    """Also compile the optional C++ node, which saves host time on CUDA; needs a compiler and ninja."""
 
 
 @command
 class Synthesize:
-    """Make pictures of synthetic hands, with mask, depth, pose, shape, camera and landmarks.
+    """Generate pictures of synthetic hands, with mask, depth, pose, shape, camera and landmarks.
 
-    They are written as tar files of 64 (WebDataset). A run that is stopped goes on when it is started again, and ends
-    with the same files. With --sheet they go on one picture instead, one for each person.
+    The outputs are tar files of 64 pictures (WebDataset). The same command continues an interrupted run and ends with
+    the same files. With --sheet, the output is one picture with one hand per person.
     """
 
-    out: Positional[Path]
-    """Folder for the shards, or the picture to write with --sheet."""
+    out: Positional[Annotated[Path, arg(metavar="OUT")]]
+    """Output folder for the tar files; with --sheet, the picture to write."""
     count: int = 64
-    """How many pictures; eight in a row show one person."""
+    """Number of pictures; eight in a row show one person."""
     seed: int = 0
-    """Seed of the world: picture k of a seed is always the same, whatever the count."""
+    """Random seed. Picture k of a seed is always the same, for any --count."""
     size: int = 256
     """Side of the pictures [px]."""
     look: Literal["photo", "even"] = "photo"
-    """Photos with everything, or hands alone in even light on black."""
+    """Complete photos, or only hands in even light on black."""
     backgrounds: Path | None = None
-    """Folder of pictures to put behind the hands, instead of rooms."""
+    """Folder of pictures to use as backgrounds instead of synthetic rooms."""
     sheet: bool = False
-    """One contact sheet instead of shards."""
+    """Write one contact sheet instead of tar files."""
     device: Device = "cpu"
 
 
@@ -175,93 +175,96 @@ class Synthesize:
 class Pretrain:
     """Train a network on synthetic hands: network.safetensors, metrics.jsonl and pictures.png.
 
-    People are baked first and kept in OUT/people, 23 MB each. A training that was stopped goes on when it is started
-    again with the same options, and on the CPU ends with the same bits. Ctrl-C ends it after the step it is at.
-    torchrun starts it on several GPUs.
+    Synthetic people are made first and kept in OUT/people, 23 MB each. Ctrl-C ends the training after the current step;
+    the same command continues it, on the CPU with the same bits as an uninterrupted run. Use torchrun for several GPUs.
     """
 
-    out: Positional[Path]
-    """Folder for what training leaves."""
+    out: Positional[Annotated[Path, arg(metavar="OUT")]]
+    """Output folder."""
     task: Literal["prior", "dense"] = "prior"
-    """The learned prior, which predicts Gaussians, or the estimator's dense network, which reads every pixel."""
+    """Network to train: the prior, which predicts Gaussians, or the estimator's dense network."""
     profile: Literal["compact", "paper"] = "compact"
-    """Sizes of the prior: ours, or the paper's."""
+    """Size of the prior: ours, or the paper's."""
     data: Literal["interhand", "hanco", "freihand", "ho3d", "coco-hand", "whim", "photos"] | None = None
-    """For the prior: a data set with MANO's parameters, beside the synthetic people."""
+    """For the prior: a data set with MANO parameters, in addition to the synthetic people."""
     root: Path | None = None
-    """Its folder, or one of tar files with what lies there."""
+    """Folder of the data set, or of its tar files."""
     mano_dir: Path | None = None
-    """Folder with MANO_RIGHT.pkl and MANO_LEFT.pkl, for --data; the one that OASIS_MANO_DIR names when not given."""
+    """Folder with MANO_RIGHT.pkl and MANO_LEFT.pkl, for --data. Default: the folder in OASIS_MANO_DIR."""
     selection: Selection = None
     data_weight: float = 0.5
-    """Share of batches that are of the data set, 0 to 1."""
+    """Share of batches from the data set, 0 to 1."""
     steps: int = 20_000
-    """Batches that each process sees."""
+    """Training steps, one batch per process each."""
     hands: int = 16
-    """Photos a batch and process, each of another person; the dense network was trained with 64."""
+    """Photos per batch and process, each of another person. The dense network was trained with 64."""
     views: int = 2
-    """For the prior: targets a photo, the same hand in other poses and even light, 1 to 8."""
+    """For the prior: targets per photo, 1 to 8. They show the same hand in other poses and even light."""
     people: int = 512
-    """How many there are."""
+    """Number of synthetic people."""
     hold_out: tuple[Kind, ...] = ()
-    """Kinds left out of training, so that `oasis evaluate` can test on what was never seen."""
+    """Kinds of hands left out of training, so that `oasis evaluate` can test on unseen kinds."""
     size: int = 256
     """Side of photos and targets [px], a multiple of 16."""
     seed: int = 0
-    """Seed of the weights, the people, the pictures and the estimator's errors."""
+    """Random seed of weights, people, pictures and simulated estimator errors."""
     device: Device = "cuda"
     precision: Literal["bf16", "float32"] = "bf16"
-    """Precision of attention and perceptrons; all else is float32."""
+    """Precision of attention and MLPs; everything else is float32."""
     workers: int = 8
-    """Processes that bake people and plan pictures ahead, for each GPU; 0 for none."""
+    """Processes per GPU that prepare people and pictures; 0 for none."""
     backbone_weights: Path | None = None
     """DINOv2's model.safetensors, for the paper's profile."""
     lpips: LpipsWeights = None
     allow_download: AllowDownload = False
     initial_weights: Annotated[Path | None, arg(aliases=["--start"])] = None  # torchrun takes --start for its own
-    """Weights to begin with: a network.safetensors of the same task and profile. From nothing when not given."""
+    """Initial weights: a network.safetensors of the same task and profile. Default: random."""
 
 
 @command
 class Evaluate:
-    """Measure what avatars are worth: metrics.json with every number, sheet.png, and a table.
+    """Evaluate avatars: metrics.json, sheet.png and a table.
 
-    On synthetic hands that no training has met, in poses and from sides that the photo does not show; on a folder of
-    photos with a subfolder for each hand, where the avatar of one photo is held against the others; by their looks,
-    where avatars of single photos are drawn from all sides and in other poses and held against real hands; or on a
-    published data set with MANO's parameters, by the paper's tables: tables.md, tables.tex and .csv. A run that was
-    stopped goes on when it is started again with the same options.
+    synthetic: new poses and views of synthetic hands that were not used in training.
+
+    same-hand: avatars of one photo compared with other photos of the same hand.
+
+    looks: avatars from all sides and in other poses compared with photos of real hands.
+
+    interhand, hanco, coco-hand, whim: published data sets with MANO parameters; writes the paper's tables as tables.md,
+    tables.tex and .csv.
+
+    The same command continues an interrupted run.
     """
 
-    folder: Positional[Path | None] = None
-    """With a subfolder of photos for each hand, or with photos of one, for same-hand; with photos of hands, for looks,
-    where its subfolders may hold more real hands to compare with."""
+    folder: Positional[Annotated[Path | None, arg(metavar="[FOLDER]")]] = None
+    """For same-hand: folder with photos of one hand, or with a subfolder for each hand. For looks: folder with photos.
+    Subfolders of the latter may hold more real hands to compare with."""
     out: OutputFolder
     dataset: Literal["synthetic", "same-hand", "looks", "interhand", "hanco", "coco-hand", "whim"] = "synthetic"
-    """What to measure on."""
+    """Data to evaluate on."""
     root: Path | None = None
     """Folder of a published data set."""
     mano_dir: Path | None = None
-    """Folder with MANO_RIGHT.pkl and MANO_LEFT.pkl, for these; the one that OASIS_MANO_DIR names when not given."""
+    """For data sets: folder with MANO_RIGHT.pkl and MANO_LEFT.pkl. Default: the folder in OASIS_MANO_DIR."""
     selection: Selection = None
     ablations: tuple[Path, ...] = ()
-    """For these: weights of networks that were trained with one part switched off, for the paper's ablation."""
+    """For data sets: weights of networks trained without one part, for the paper's ablation."""
     prior: Literal["learned", "none"] | Path = "learned"
-    """The learned prior to hold against the mean hand, as for `oasis reconstruct`; none for the mean hand alone."""
+    """Prior to compare with the mean hand, as for `oasis reconstruct`; none evaluates only the mean hand."""
     backbone_weights: BackboneWeights = None
     people: int = 16
-    """Synthetic people without tattoo or ring, and as many with each; or photos of each person of a data set that
-    avatars are made of."""
+    """Synthetic people without tattoo or ring, and as many with each. For data sets: input photos per person."""
     targets: int = 4
-    """Pictures to compare each of them with; of synthetic people 1 to 8."""
+    """Pictures to compare each avatar with; 1 to 8 for synthetic people."""
     steps: int | None = None
-    """Steps of texture learning; stops by itself when not given."""
+    """Steps of texture learning. Default: until the loss is flat."""
     size: int = 256
-    """Side of the pictures [px]; a multiple of 16 for synthetic ones, and 256 for looks."""
+    """Side of the pictures [px]: a multiple of 16 for synthetic hands, 256 for looks."""
     seed: int = 0
-    """Seed of people, pictures and adaptation."""
+    """Random seed of people, pictures and adaptation."""
     lpips: LpipsWeights = None
     allow_download: AllowDownload = False
     device: Device = "cpu"
     workers: int = 0
-    """Processes that measure synthetic people side by side; 0 for none."""
+    """Processes that evaluate synthetic people in parallel; 0 for none."""

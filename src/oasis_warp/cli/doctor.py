@@ -131,7 +131,7 @@ def check_single_opencv() -> str:
     if others:
         ours = "opencv-contrib-python-headless"
         remedy = f"run `pip uninstall -y {' '.join(others)}`, then `pip install --force-reinstall --no-deps {ours}`"
-        raise FaultError(f"{', '.join(others)} installed as well", remedy)
+        raise FaultError(f"{', '.join(others)} is installed too and overwrites cv2", remedy)
     return f"cv2 {cv2.__version__}"
 
 
@@ -148,7 +148,7 @@ def check_cuda() -> str:
     import torch
 
     if not torch.cuda.is_available():
-        return "no device; everything runs on the CPU"
+        return "no device found; everything runs on the CPU"
     devices = [torch.cuda.get_device_properties(i) for i in range(torch.cuda.device_count())]
     return ", ".join(f"{device.name} ({device.total_memory >> 30} GiB)" for device in devices)
 
@@ -172,7 +172,7 @@ def check_networks() -> str:
     from oasis_warp.estimation.networks import check_networks
 
     check_networks()
-    return "palm detection and hand landmarks give the known answers"
+    return "palm detection and hand landmarks give the expected results"
 
 
 def check_prior() -> str:
@@ -208,7 +208,7 @@ def check_kernels() -> str:
         if not error <= TOLERANCE:
             raise FaultError(f"{device}: a Gaussian is off by {error:.1e}", f"delete {cache} and run this again")
     times = ", ".join(f"{took:.1f} s on {device}" for device, took in seconds.items())
-    return f"draw what the formula says; loaded or compiled in {times}; cache {cache}"
+    return f"a Gaussian is drawn correctly; loaded or compiled in {times}; cache {cache}"
 
 
 def check_extension(build: bool) -> str:
@@ -219,10 +219,10 @@ def check_extension(build: bool) -> str:
         try:
             picture_extension.build()
         except picture_extension.NotBuiltError as error:
-            remedy = "it needs a C++ compiler, Python's headers and ninja; without it nothing is missing but time"
+            remedy = "it needs a C++ compiler, Python's headers and ninja; it is optional and only saves time"
             raise FaultError(f"could not be built: {error}", remedy) from error
     if not picture_extension.is_built():
-        return "not built; Python does its work, and `oasis doctor --build-extension` builds it"
+        return "not built (optional); `oasis doctor --build-extension` builds it"
     return f"built for torch {importlib.metadata.version('torch')}, in {picture_extension.extension_folder()}"
 
 

@@ -32,9 +32,9 @@ MEASURES = {
     "painted_mm2": ("skin painted", "{:.0f} mm²"),
     "new_gaussians": ("new Gaussians", "{:.0f}"),
     "n_gaussians": ("Gaussians", "{:.0f}"),
-    "left_out_percent": ("paint left out, on a slant", "{:.1f} %"),
-    "input_psnr_db": ("likeness to the painted photo", "{:.1f} dB"),
-    "unchanged_psnr_db": ("likeness to before, elsewhere", "{:.1f} dB"),
+    "left_out_percent": ("paint left out, at grazing angles", "{:.1f} %"),
+    "input_psnr_db": ("PSNR to the painted photo", "{:.1f} dB"),
+    "unchanged_psnr_db": ("PSNR to before, outside the paint", "{:.1f} dB"),
 }
 """Name and unit of the measures in `Edit.measures`."""
 

@@ -79,7 +79,7 @@ def run(options: Evaluate) -> int:
             made = tables[options.dataset](options, priors, shown.progress)
     except KeyboardInterrupt:
         keep_command(options.out)
-        print(f"oasis: stopped; what is whole stays in {options.out}, the same command goes on.", file=sys.stderr)
+        print(f"oasis: stopped; finished parts stay in {options.out}, the same command continues.", file=sys.stderr)
         return INTERRUPTED
     keep_command(options.out)
     print_tables(made, TABLE_WIDTH)
@@ -94,14 +94,14 @@ def check_options(options: Evaluate) -> None:
     """
     photos, published = options.dataset in ("same-hand", "looks"), options.dataset in PUBLISHED
     if published and (options.root is None or options.prior == "none"):
-        raise InputError(f"--dataset {options.dataset}: expected its folder, --root, and a learned prior; give both.")
+        raise InputError(f"--dataset {options.dataset}: expected --root FOLDER and a learned prior; give both.")
     for name in ("root", "mano_dir", "ablations"):
         if getattr(options, name) and not published:
-            raise InputError(f"--{name.replace('_', '-')}: is for {', '.join(PUBLISHED)}; leave it out.")
+            raise InputError(f"--{name.replace('_', '-')}: works only with {', '.join(PUBLISHED)}; leave it out.")
     if options.selection is not None and options.dataset != "interhand":
-        raise InputError("--selection: is for --dataset interhand; leave it out.")
+        raise InputError("--selection: works only with --dataset interhand; leave it out.")
     if photos and options.folder is None:
-        kind = "a folder of photos" + (", or one with a subfolder a hand" if options.dataset == "same-hand" else "")
+        kind = "a folder of photos" + (", or of subfolders, one per hand" if options.dataset == "same-hand" else "")
         raise InputError(f"--dataset {options.dataset}: expected {kind}; name it.")
     if not photos and options.folder is not None:
         kind = "a data set has --root" if published else "synthetic hands need no folder"
@@ -113,7 +113,7 @@ def check_options(options: Evaluate) -> None:
     if options.people < 1:
         raise InputError(f"--people: expected 1 or more, got {options.people}.")
     if not 1 <= options.targets <= (options.targets if published else PICTURES_EACH):
-        raise InputError(f"--targets: expected 1 to {PICTURES_EACH}, got {options.targets}; more people do the same.")
+        raise InputError(f"--targets: expected 1 to {PICTURES_EACH}, got {options.targets}; increase --people instead.")
     if options.size not in SIZES or (not photos and options.size % MULTIPLE):
         kind = "pixels" if photos else f"pixels in steps of {MULTIPLE}"
         raise InputError(f"--size: expected {SIZES[0]} to {SIZES[-1]} {kind}, got {options.size}.")

@@ -19,7 +19,7 @@ def run(options: Export) -> int:
     writer = choose_writer(options.out)  # refuse a wrong ending before the avatar is read
     photo = None if options.photo is None else read_photo(options.photo)
     if photo is not None and writer is not write_page:
-        raise InputError(f"{options.out}: has no room for --photo; write a name that ends in .html, or leave it out.")
+        raise InputError(f"{options.out}: cannot hold --photo; choose a name that ends in .html, or leave it out.")
     avatar = Avatar.load(options.avatar)
     pose = None if options.pose == "auto" else choose_pose(avatar, options.pose)
     light = None if options.light == "auto" else options.light

@@ -1,4 +1,4 @@
-"""`oasis info`: what is in avatar files."""
+"""`oasis info`: the contents of avatar files."""
 
 from pathlib import Path
 from typing import Any
@@ -19,15 +19,15 @@ FACTS = {
     "side": ("side", "{}"),
     "hand_model": ("hand model", "{}"),
     "version": ("file version", "{}"),
-    "creator": ("made by", "{}"),
-    "megabytes": ("file", "{:.1f} MB"),
+    "creator": ("created by", "{}"),
+    "megabytes": ("file size", "{:.1f} MB"),
     "n_gaussians": ("Gaussians", "{}"),
-    "median_size_mm": ("their median size", "{:.2f} mm"),
+    "median_size_mm": ("median size of a Gaussian", "{:.2f} mm"),
     "length_mm": ("wrist to middle fingertip", "{:.0f} mm"),
-    "breadth_mm": ("breadth over the knuckles", "{:.0f} mm"),
-    "painted_percent": ("skin that is painted, not seen", "{:.0f} %"),
+    "breadth_mm": ("breadth across the knuckles", "{:.0f} mm"),
+    "painted_percent": ("surface inpainted", "{:.0f} %"),
     "light": ("light", "{}"),
-    "photo_px": ("photo's crop", "{} px"),
+    "photo_px": ("crop of the photo", "{} px"),
 }
 """Name and form of every fact."""
 MIDDLE_TIP, INDEX_BASE, LITTLE_BASE = 2, 1, 7
@@ -86,6 +86,6 @@ def describe(path: Path) -> tuple[Avatar, dict[str, Any]]:
 
 def _light(avatar: Avatar) -> str:
     if avatar.light is None:
-        return "in the colours, or even"
-    hidden = "" if avatar.light.albedo is None else ", with what the hand hides of it"
+        return "none stored"
+    hidden = "" if avatar.light.albedo is None else " with self-occlusion"
     return f"{len(avatar.light.harmonics)} spherical harmonics{hidden}"

@@ -18,7 +18,7 @@ MAX_WAITING = 16
 MAX_SECONDS = 900
 """Time for one photo, some fifty times what it takes on two quiet cores."""
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".avif", ".bmp", ".tif", ".tiff")
-SILENT = "The program said nothing."
+SILENT = "The program failed without a message."
 EXPORTS = (".html", ".glb", ".ply", ".spz")
 """Formats that are written on request."""
 PROGRAM = (sys.executable, "-m", "oasis_warp")
@@ -147,7 +147,7 @@ class Jobs:
     def _reconstruct(self, home: Path) -> None:
         photo = next(home.glob("photo.*"), None)
         if photo is None:  # the server was stopped before the photo was whole
-            write_file(home / "error.txt", b"The photo did not arrive; send it again.")
+            write_file(home / "error.txt", b"The photo did not arrive completely; send it again.")
             return
         command = [*PROGRAM, "reconstruct", str(photo), "-o", str(home / "out")]
         with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
@@ -167,7 +167,7 @@ class Jobs:
         if code == 0 or self._stopped:
             return
         late = time.monotonic() - started >= MAX_SECONDS
-        message = f"It took more than {MAX_SECONDS // 60} minutes." if late else last_line(line, SILENT, 500)
+        message = f"It took longer than {MAX_SECONDS // 60} minutes." if late else last_line(line, SILENT, 500)
         write_file(
             home / "error.txt", message.replace(str(photo), "the photo").replace(photo.name, "the photo").encode()
         )

@@ -69,7 +69,7 @@ def run(options: Pretrain) -> int:
     if done == options.steps:
         return 0
     if process.rank == 0:
-        print(f"oasis: stopped; what is done stays in {options.out}, the same command goes on.", file=sys.stderr)
+        print(f"oasis: stopped; finished steps stay in {options.out}, the same command continues.", file=sys.stderr)
     return INTERRUPTED
 
 
@@ -84,7 +84,7 @@ def check_options(options: Pretrain) -> None:
         if value < least:
             raise InputError(f"--{name}: expected {least} or more, got {value}.")
     if not 1 <= options.views <= PICTURES_EACH:
-        raise InputError(f"--views: expected 1 to {PICTURES_EACH}, got {options.views}; more hands do the same.")
+        raise InputError(f"--views: expected 1 to {PICTURES_EACH}, got {options.views}; increase --hands instead.")
     if options.size not in SIZES:
         raise InputError(
             f"--size: expected a multiple of {MULTIPLE} from {SIZES[0]} to {SIZES[-1]} pixels, got {options.size}."
@@ -94,13 +94,13 @@ def check_options(options: Pretrain) -> None:
     if (options.data is None) != (options.root is None):
         raise InputError("--data and --root belong together: the name of a data set, and its folder; give both.")
     if options.selection is not None and options.data != "interhand":
-        raise InputError("--selection: is for --data interhand; leave it out.")
+        raise InputError("--selection: works only with --data interhand; leave it out.")
     if options.task == "prior":
         check_prior_options(options)
     else:
         for name in ("profile", "views", "hold_out", "backbone_weights", "lpips", "data"):
             if getattr(options, name) != getattr(Pretrain, name, None):
-                raise InputError(f"--{name.replace('_', '-')}: is for --task prior, got it with dense; leave it out.")
+                raise InputError(f"--{name.replace('_', '-')}: works only with --task prior; leave it out.")
 
 
 def check_prior_options(options: Pretrain) -> None:

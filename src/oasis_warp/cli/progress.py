@@ -272,7 +272,8 @@ class _RunBar(Bars):
 
     def get_renderables(self) -> Iterable[RenderableType]:
         if self._bar is not None:
-            self.update(self._bar, completed=self._run.share, description=escape(self._run.what), left=_left(self._run))
+            what = escape(self._run.what or "working")
+            self.update(self._bar, completed=self._run.share, description=what, left=_left(self._run))
         return super().get_renderables()
 
     @contextlib.contextmanager

@@ -66,7 +66,7 @@ def _check_photos(options: Reconstruct) -> None:
     if not options.photos:
         raise InputError("photos: expected at least one, got none; name them after `oasis reconstruct`.")
     if len(options.photos) > 1 and options.keypoints is not None:
-        raise InputError("--keypoints: belongs to one photo, but several were given; run them one by one.")
+        raise InputError("--keypoints: works with one photo, but several were given; run them one by one.")
     if options.same_hand:
         return
     counts = Counter(photo.stem for photo in options.photos)
@@ -89,9 +89,9 @@ def _is_one_hand(options: Reconstruct) -> bool:
         return False
     seen = f"The photos show the palm and the back of a {one.side} hand."
     if sys.stdin.isatty() and sys.stderr.isatty():
-        print(f"{seen} Are both of one hand, to make one avatar of them? [Y/n] ", end="", file=sys.stderr, flush=True)
+        print(f"{seen} Is it one hand, to make one avatar of both? [Y/n] ", end="", file=sys.stderr, flush=True)
         return sys.stdin.readline().lower() in ("\n", "y\n", "yes\n")
-    print(f"{seen} If both are of one hand, --same-hand makes one avatar of them.", file=sys.stderr)
+    print(f"{seen} If both show the same hand, --same-hand makes one avatar of them.", file=sys.stderr)
     return False
 
 

@@ -74,7 +74,8 @@ def read_color(text: str) -> tuple[float, float, float]:
         return COLORS[text]
     digits = text.removeprefix("#")
     if len(digits) != 6 or not all(digit in "0123456789abcdefABCDEF" for digit in digits):
-        raise InputError(f"--background {text}: expected {', '.join(COLORS)} or six hex digits; write e.g. d0e0f0.")
+        names = ", ".join((*COLORS, "transparent"))
+        raise InputError(f"--background {text}: expected {names} or six hex digits; write e.g. d0e0f0.")
     red, green, blue = bytes.fromhex(digits)
     return red / 255, green / 255, blue / 255
 

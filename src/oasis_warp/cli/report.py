@@ -11,37 +11,39 @@ from rich.console import Console
 from rich.table import Table
 
 from oasis_warp import __version__
-from oasis_warp.cli.record import exact_command
+from oasis_warp.cli.record import exact_command, is_quiet
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.types import HandFit, Photo
 from oasis_warp.reconstruction import FusedReconstruction, Reconstruction
 
 MEASURES = {
-    "reprojection_percent": ("landmarks miss the model by", "{:.1f} % of the hand"),
-    "worst_point_percent": ("the worst of them by", "{:.1f} %"),
-    "mask_iou": ("overlap of fit and mask", "{:.3f}"),
-    "refined_px": ("refinement moved the surface by", "{:.1f} px"),
-    "input_psnr_db": ("likeness to the photo", "{:.1f} dB"),
-    "input_psnr_inner_db": ("likeness away from the outline", "{:.1f} dB"),
+    "reprojection_percent": ("reprojection error", "{:.1f} % of the hand"),
+    "worst_point_percent": ("worst landmark", "{:.1f} % of the hand"),
+    "mask_iou": ("mask IoU of the fit", "{:.3f}"),
+    "refined_px": ("shift by the refinement", "{:.1f} px"),
+    "input_psnr_db": ("PSNR to the photo", "{:.1f} dB"),
+    "input_psnr_inner_db": ("PSNR inside the outline", "{:.1f} dB"),
     "input_lpips": ("LPIPS to the photo", "{:.3f}"),
-    "render_mask_iou": ("overlap of avatar and mask", "{:.3f}"),
-    "seen_percent": ("surface that the photo shows", "{:.0f} %"),
-    "grazed_percent": ("surface that it grazes", "{:.0f} %"),
-    "extrapolated_percent": ("surface that it does not show", "{:.0f} %"),
-    "palm_seen_percent": ("palm that it shows", "{:.0f} %"),
-    "back_seen_percent": ("back that it shows", "{:.0f} %"),
-    "nail_seen_percent": ("nails that it shows", "{:.0f} %"),
-    "invented_percent": ("skin that is painted", "{:.0f} %"),
+    "render_mask_iou": ("mask IoU of the avatar", "{:.3f}"),
+    "seen_percent": ("surface seen", "{:.0f} %"),
+    "grazed_percent": ("surface seen at grazing angles", "{:.0f} %"),
+    "extrapolated_percent": ("surface unseen", "{:.0f} %"),
+    "palm_seen_percent": ("palm seen", "{:.0f} %"),
+    "back_seen_percent": ("back seen", "{:.0f} %"),
+    "nail_seen_percent": ("nails seen", "{:.0f} %"),
+    "invented_percent": ("surface inpainted", "{:.0f} %"),
     "uncertainty_mean": ("mean uncertainty", "{:.2f}"),
     "n_gaussians": ("Gaussians", "{:.0f}"),
 }
 """Name and unit of the measures in `Reconstruction.errors`; others are shown under their keys."""
+TITLE = 76
+"""Longest title that stays on one line [characters]."""
 COLUMNS = {
-    "seen_percent": ("shows", "{:.0f} %"),
-    "best_percent": ("best in", "{:.0f} %"),
-    "reprojection_percent": ("landmarks off", "{:.1f} %"),
-    "mask_iou": ("fit and mask", "{:.3f}"),
-    "input_psnr_db": ("likeness", "{:.1f} dB"),
+    "seen_percent": ("seen", "{:.0f} %"),
+    "best_percent": ("best seen", "{:.0f} %"),
+    "reprojection_percent": ("reprojection", "{:.1f} %"),
+    "mask_iou": ("mask IoU", "{:.3f}"),
+    "input_psnr_db": ("PSNR", "{:.1f} dB"),
 }
 """Heading and unit of the columns for several photos; shares are of the hand's surface."""
 
@@ -132,7 +134,7 @@ def measures_table(
     title: str, seconds: Mapping[str, float], measures: Mapping[str, float], names: Mapping[str, tuple[str, str]]
 ) -> Table:
     """A table of the times of stages and of measures, with name and unit of each from `names`."""
-    table = Table(title=title, show_header=False)
+    table = Table(title=title, show_header=False, min_width=min(len(title), TITLE))  # or the title is wrapped
     table.add_column()
     table.add_column(justify="right")
     for stage, duration in seconds.items():
@@ -145,7 +147,7 @@ def measures_table(
 
 def _photos_table(title: str, report: Mapping[str, Any]) -> Table:
     seen, seconds = report["errors"]["seen_percent"], report["seconds"]["total"]
-    table = Table(title=title, caption=f"together {seen:.0f} % of the surface, {seconds:.1f} s")
+    table = Table(title=title, caption=f"all photos: {seen:.0f} % of the surface seen, {seconds:.1f} s")
     table.add_column("photo")
     for heading, _ in COLUMNS.values():
         table.add_column(heading, justify="right")
@@ -155,6 +157,8 @@ def _photos_table(title: str, report: Mapping[str, Any]) -> Table:
 
 
 def print_warnings(console: Console, warnings: Sequence[str]) -> None:
-    """Print a line for each warning."""
+    """Print a line for each warning; with --quiet, which silences `console`, on standard error."""
+    if is_quiet():
+        console = Console(stderr=True, markup=False)
     for warning in warnings:
         console.print(f"Warning: {warning}", style="yellow", highlight=False, soft_wrap=True)

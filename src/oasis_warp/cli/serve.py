@@ -63,7 +63,7 @@ class _Handler(LoopbackHandler):
             return
         if len(length) > MAX_DIGITS or int(length) > MAX_BYTES:
             self.close_connection = True  # the photo is not read
-            self._send_json({"error": f"The photo has more than {MAX_BYTES >> 20} MB; send a smaller one."}, 413)
+            self._send_json({"error": f"The photo is larger than {MAX_BYTES >> 20} MB; send a smaller one."}, 413)
             return
         photo = self.rfile.read(int(length))
         if len(photo) < int(length):
@@ -96,7 +96,7 @@ def run(options: Serve) -> int:
         worker = threading.Thread(target=jobs.work)
         worker.start()
         try:
-            serve(server, f"Photos are taken at {server.address} until Ctrl-C.", no_browser=options.no_browser)
+            serve(server, f"The form is at {server.address} until Ctrl-C.", no_browser=options.no_browser)
         finally:
             jobs.stop()
             worker.join()

@@ -112,9 +112,9 @@ def draw_summary(
     avatar = made.avatar
     if isinstance(made, Reconstruction):
         fits, fit = [made.fit], made.fit
-        measures = [f"landmarks {fit.reprojection:.1f} % off", f"mask overlap {fit.mask_iou:.2f}"]
+        measures = [f"reprojection error {fit.reprojection:.1f} %", f"mask IoU {fit.mask_iou:.2f}"]
         if "input_psnr_db" in made.errors:
-            measures.append(f"{made.errors['input_psnr_db']:.1f} dB to the photo")
+            measures.append(f"PSNR {made.errors['input_psnr_db']:.1f} dB")
     else:
         fits = [photo.fit for photo in made.photos]
         measures = [f"{made.errors['seen_percent']:.0f} % of the surface seen"]
@@ -139,7 +139,7 @@ def draw_summary(
     side = panel_side(4, WIDTH)
     rows = [photo_row(photo, avatar, fit, draw, side) for photo, fit in zip(photos, fits, strict=True)]
     if made.warnings:
-        measures = [*measures, "doubtful: see the warnings in report.json"]
+        measures = [*measures, "warnings: see report.json"]
     title = f"{', '.join(photo.name for photo in photos)}, {first.side} hand"
     return torch.from_numpy(make_sheet(title, ", ".join(measures), [*rows, views, poses], WIDTH))
 
@@ -161,7 +161,7 @@ def photo_row(
         Panel(crop, "photo"),
         Panel(draw_landmarks(fitted, points.cpu().numpy()), "landmarks and fitted hand"),
         Panel(to_uint8(mask[..., None].expand(-1, -1, 3)).numpy(), "mask"),
-        Panel(draw(camera, fit.pose), "avatar, the photo's view"),
+        Panel(draw(camera, fit.pose), "avatar, view of the photo"),
     ]
 
 
@@ -186,13 +186,16 @@ def draw_quality(title: str, avatar: Avatar, quality: SurfaceQuality) -> UInt8[T
     shown = torch.tensor(UNSEEN_COLOR).repeat(len(visibility), 1)
     shown[visibility > 0] = torch.tensor(GRAZED_COLOR)
     shown[visibility >= SEEN] = torch.tensor(SEEN_COLOR)
-    legend = f"seen (green), grazed (yellow){'' if quality.invented is None else ', invented (grey)'}"
     panels = [
         Panel(_paint(posed, faces, colors, orbit_camera(posed.vertices, azimuth, size=side)), f"{what}, {where}")
-        for what, colors in ((legend, shown), ("uncertainty", _heat(quality.uncertainty)))
+        for what, colors in (("visibility", shown), ("uncertainty", _heat(quality.uncertainty)))
         for where, azimuth in (("from the photo's side", 0.0), ("from behind", math.pi))
     ]  # fmt: skip
-    subtitle = "uncertainty: blue is as the photo shows it, yellow is guessed"
+    unseen = "unseen" if quality.invented is None else "inpainted"
+    subtitle = (
+        f"visibility: green is seen, yellow at grazing angles, grey {unseen}; "
+        "uncertainty: blue is as in the photo, yellow is guessed"
+    )
     return torch.from_numpy(make_sheet(title, subtitle, [panels], WIDTH))
 
 

@@ -47,7 +47,7 @@ def run(options: Synthesize) -> int:
                 scene=scene, batch=BATCH[options.device], progress=progress,
             )  # fmt: skip
         except KeyboardInterrupt:
-            print(f"oasis: stopped; what is whole stays in {options.out}, the same command goes on.", file=sys.stderr)
+            print(f"oasis: stopped; finished parts stay in {options.out}, the same command continues.", file=sys.stderr)
             return INTERRUPTED
     return 0
 

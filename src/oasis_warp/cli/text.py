@@ -31,7 +31,7 @@ def run(options: Text) -> int:
     if not SIZES[0] <= options.size <= SIZES[1]:
         raise InputError(f"--size {options.size}: expected {SIZES[0]} to {SIZES[1]} pixels; choose another size.")
     if options.tries < 1:
-        raise InputError(f"--tries {options.tries}: expected at least 1; ask for more.")
+        raise InputError(f"--tries {options.tries}: expected at least 1; choose a larger number.")
     if not options.words.strip():
         raise InputError('words: expected a description, got none; write e.g. "a fisherman\'s tanned hand".')
     generator = None if options.generator is None else choose_generator(options.generator)
@@ -43,9 +43,9 @@ def run(options: Text) -> int:
         (part / "prompt.txt").write_text(prompt + "\n", encoding="utf-8")
     if generator is None:
         print(
-            f"{options.out}: depth.png, normal.png, canny.png, mask.png and prompt.txt are there. Make a picture from "
-            f"them with an image generator, then run this again with --generator PICTURE; or let it be made: "
-            f"--generator with a folder of a diffusers ControlNet pipeline, or with a command.",
+            f"{options.out}: depth.png, normal.png, canny.png, mask.png and prompt.txt are written. Make a picture "
+            f"from them with an image generator and run this again with --generator PICTURE. --generator also takes "
+            f"the folder of a diffusers ControlNet pipeline, or a command.",
             file=sys.stderr,
         )
         return 0
@@ -58,7 +58,7 @@ def run(options: Text) -> int:
     with output_folder(options.out) as part:
         write_picture(part / "picture.png", made.photo.rgb)
         (part / "pose.json").write_text(json.dumps(keypoints(conditioning, made.photo.rgb.shape[1]), indent=1))
-    print(f"seed {made.seed}: landmarks {made.distance:.1f} % of the hand's size off", file=sys.stderr)
+    print(f"seed {made.seed}: the landmarks are {made.distance:.1f} % of the hand's size off", file=sys.stderr)
     config = ReconstructConfig(seed=options.seed)
     report = reconstruct_folder([options.out / "picture.png"], options.out, config, options.out / "pose.json")
     print_report(Console(), report)

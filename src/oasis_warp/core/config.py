@@ -64,48 +64,46 @@ class ReconstructConfig:
     """From a photo to an avatar."""
 
     hand: Literal["left", "right", "largest"] | int = "largest"
-    """The hand of the photo to use: a side, the largest, or a number from 0 for the best found, 1 for the next."""
+    """Hand of the photo to use: its side, the largest, or its rank among the detections (0 is the best)."""
     prior: Literal["learned", "none"] | Path = "learned"
-    """What to assume of the hand before the photo is fitted: what the bundled network sees in the photo, only mean
-    colours in its skin tone, or what your own network sees: network.safetensors of `oasis pretrain`."""
+    """Prior used before the fit: the bundled network, mean colours in the photo's skin tone, or your own network.
+    Your own network is the network.safetensors of `oasis pretrain`."""
     backbone_weights: Path | None = None
-    """DINOv2's model.safetensors, for a network of your own in the paper's profile."""
+    """DINOv2's model.safetensors, for your own network with the paper's profile."""
     hand_model: Literal["bundled", "mano"] = "bundled"
-    """The hand that comes with the package, or MANO from your own files."""
+    """Hand model: the bundled one, or MANO from your own files."""
     mano_dir: Path | None = None
-    """Folder with MANO_RIGHT.pkl, for --hand-model mano; the one that OASIS_MANO_DIR names when not given."""
+    """Folder with MANO_RIGHT.pkl, for --hand-model mano. Default: the folder in OASIS_MANO_DIR."""
     refine: Literal["on", "off"] = "off"
-    """Move the fitted hand to where what the prior saw in the photo explains it better, and look again; or leave it."""
+    """Refine the pose by matching the prior's rendering to the photo."""
     light: Literal["fit", "keep", "even"] = "fit"
-    """The photo's light: fit it, so that it stays where it is when the hand turns; keep it on the skin, shadows too; or
-    leave it out wherever one can tell."""
+    """The photo's light: fit it, so that it stays in place when the hand turns; keep it as part of the skin, with its
+    shadows; or remove it as far as possible."""
     adapt: Literal["field", "lora"] = "field"
-    """What learns one photo's detail: a field over the skin; or, as in the paper, low-rank updates of the learned prior
-    in 100 steps of calibration and 400 of learning (the paper's own also has --light keep --unseen plain)."""
+    """How detail of the photo is learned: a field over the skin, or the paper's LoRA (100 + 400 steps).
+    The paper's full method is --adapt lora --light keep --unseen plain."""
     unseen: Literal["painted", "plain"] = "painted"
-    """Skin that no photo shows: paint folds, veins and nails of a plausible person in the tone of the hand, another for
-    every seed; or leave the smooth colours of the prior."""
+    """Unseen skin: paint plausible folds, veins and nails (varied by --seed), or keep the prior's smooth colours."""
     steps: int | None = None
-    """Steps of texture learning; stops by itself when not given."""
+    """Steps of texture learning. Default: until the loss is flat."""
     seed: int = 0
-    """The same seed gives the same avatar."""
+    """Random seed. The same seed gives the same avatar."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where to compute."""
+    """Device that computes."""
     size: int | Literal["auto"] = "auto"
-    """Side of the square crop whose detail the avatar shows [px], 64 to 1024; by itself the photo's own, from 256 to
-    1024."""
+    """Side of the crop that the avatar learns from [px], 64 to 1024. auto: the photo's own, within 256 to 1024."""
     force: bool = False
-    """Go on with a fit that is too poor to be trusted."""
+    """Use a fit even if it is too poor."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class EditConfig:
-    """How a painted photo is brought into an avatar."""
+    """How paint on a photo is transferred to an avatar."""
 
     steps: int = 40
-    """Steps of the colours' fit; each is worth many of a plain optimiser's."""
+    """Steps of the colour fit. One step does the work of many steps of a plain optimizer."""
     size: int = 1024
-    """Side of the square around the hand above which the painted picture is scaled down [px]."""
+    """Largest side of the square around the hand [px]; a larger painted picture is scaled down."""
 
 
 def check_config(config: AdaptConfig | ReconstructConfig | EditConfig, flag: str = "") -> None:
@@ -125,8 +123,8 @@ def check_config(config: AdaptConfig | ReconstructConfig | EditConfig, flag: str
     if isinstance(size, int) and not low <= size <= high:
         raise InputError(f"{flag}size {size}: expected {low} to {high} pixels; choose another size.")
     for name, hint in (
-        ("steps", "leave it out for the default"), ("texture_steps", "leave it out to stop by itself"),
-        ("calibration_steps", "0 takes the closed form"), ("hand", "0 is the best hand found"),
+        ("steps", "leave it out for the default"), ("texture_steps", "leave it out to stop automatically"),
+        ("calibration_steps", "0 uses the closed form"), ("hand", "0 is the best detection"),
     ):  # fmt: skip
         value = getattr(config, name, None)
         if isinstance(value, int) and value < 0:

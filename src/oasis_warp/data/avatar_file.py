@@ -144,7 +144,7 @@ def read_avatar_header(path: Path | str) -> dict[str, Any]:
 def _header_of(path: Path, file: Any) -> dict[str, Any]:
     text = (file.metadata() or {}).get(FORMAT)
     if text is None:
-        raise InputError(f"{path}: a safetensors file, but no avatar; give the one `oasis reconstruct` wrote.")
+        raise InputError(f"{path}: a safetensors file, but not an avatar; give one that `oasis reconstruct` wrote.")
     return _read_header(path, text)
 
 
@@ -188,7 +188,7 @@ def _read_header(path: Path, text: str) -> dict[str, Any]:
         version = header.get("version")
         if isinstance(version, int) and version > VERSION:  # before any other check
             raise InputError(
-                f"{path}: avatar file of version {version}, but {VERSION} is the last known here; update oasis-warp."
+                f"{path}: avatar file of version {version}, newer than the known {VERSION}; update oasis-warp."
             )
         _check_header(header)
     except InputError:

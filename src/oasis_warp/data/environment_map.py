@@ -53,7 +53,7 @@ def read_environment(path: Path | str) -> Float[Tensor, "H W 3"]:
     if pixels.dtype != np.float32:
         light = (light / np.iinfo(pixels.dtype).max) ** GAMMA
     if not np.isfinite(light).all() or light.min() < 0 or light.max() <= 0:
-        raise InputError(f"{path}: expected light from 0 up, got none, or values that are no light; give another file.")
+        raise InputError(f"{path}: expected finite values of at least 0, not all 0; give another file.")
     if height > LARGEST:
         light = cv2.resize(light, (2 * LARGEST, LARGEST), interpolation=cv2.INTER_AREA)
     return torch.from_numpy(np.ascontiguousarray(light))

@@ -135,7 +135,7 @@ def _not_an_image(path: Path, data: bytes) -> InputError:
         return _cut_short(path, len(data))
     if name := unsupported_format(data):
         return InputError(f"{path}: expected {READABLE}, got {name}; save the photo as JPEG or PNG first.")
-    return InputError(f"{path}: expected {READABLE}, got something that is no image; give the photo itself.")
+    return InputError(f"{path}: expected {READABLE}, got a file that is not an image; give the photo itself.")
 
 
 def _cut_short(path: Path, n_bytes: int) -> InputError:

@@ -130,7 +130,7 @@ def write_video(path: Path | str, frames: Iterable[UInt8[Tensor, "H W C"]], fps:
         )
         # Neither encoder reports all errors, so check the file.
         if _count_frames(part) != count:
-            raise InputError(f"{path}: the video could not be written whole; free some space or choose another disk.")
+            raise InputError(f"{path}: the video could not be written; free some space or choose another disk.")
     return count
 
 
@@ -211,7 +211,7 @@ def _open_writer(path: Path, part: Path, fps: float, size: tuple[int, int]) -> c
         writer = cv2.VideoWriter(str(part), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), fps, size)
         if writer.isOpened():
             return writer
-    raise InputError(f"{path}: this build of OpenCV writes no MP4; give a name that ends in .gif instead.")
+    raise InputError(f"{path}: this build of OpenCV cannot write MP4; choose a name that ends in .gif instead.")
 
 
 def _count_frames(path: Path) -> int:

@@ -144,13 +144,13 @@ class HandEstimator:
             warnings += side_warnings(landmarks.side, start.cost, other_cost, detections)
         refused = quality.beyond(REFUSE_BOUNDS)
         if len(fingers) >= MANY_FINGERS:
-            refused.append("the network sees the hand elsewhere")
+            refused.append("a second detection places the hand elsewhere")
         if stray > STRAY_SHARE:
-            refused.append(f"{100 * stray:.0f} % of the hand's pixels lie elsewhere on the model")
+            refused.append(f"{100 * stray:.0f} % of the hand's pixels do not match the model")
         if refused and not force:
             raise InputError(
                 f"{photo.name}: the fit of the {landmarks.side} hand is too poor to use, {' and '.join(refused)}; "
-                "give a sharper photo of the open hand, or force it."
+                "give a sharper photo of the open hand, or use the fit anyway with --force."
             )
         return HandFit(
             side=landmarks.side,
@@ -171,7 +171,7 @@ class HandEstimator:
         reading = read_pixels(view.rgb, xy, bundled_dense_network(self.device))
         mask = None if view.alpha is None else mask_from_alpha(view.alpha, reading, xy, scale)
         if view.alpha is not None and mask is None:
-            warnings.append("the photo's own cut-out was left aside: it does not show this hand alone and whole")
+            warnings.append("the photo's transparency was ignored: it does not outline this whole hand alone")
         mask = mask_from_reading(view.rgb, reading, xy) if mask is None else mask
         outline, points = MaskOutline(mask, xy), surface_points(self.kinematics, reading, scale)
         found = fitter.fit_surface(start.state, points)
@@ -203,9 +203,9 @@ def choose_hand(
             return of_side[0]
         wanted = f"a {which} hand"
     listed = ", ".join(
-        f"{i}: {hand.side}, {box_size(array(hand.xy)):.0f} px" for i, hand in enumerate(found)
+        f"hand {i} ({hand.side}, {box_size(array(hand.xy)):.0f} px)" for i, hand in enumerate(found)
     )
-    raise InputError(f"{photo_name}: expected {wanted}, found {listed}; choose one of these, or mirror the photo.")
+    raise InputError(f"{photo_name}: expected {wanted}, found {listed}; choose another --hand, or mirror the photo.")
 
 
 def shared_shape(shapes: Sequence[Float[Tensor, "S"]]) -> Float[Tensor, "S"]:

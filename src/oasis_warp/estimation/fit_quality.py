@@ -75,13 +75,13 @@ class FitQuality:
         """The numbers that break `bounds`, in words."""
         broken = []
         if self.reprojection > bounds.reprojection:
-            broken.append(f"the landmarks lie {self.reprojection:.1f} % of the hand's size from the model's")
+            broken.append(f"the reprojection error is {self.reprojection:.1f} % of the hand's size")
         if self.worst_point > bounds.worst_point:
-            broken.append(f"one landmark lies {self.worst_point:.1f} % of the hand's size from the model's")
+            broken.append(f"one landmark is {self.worst_point:.1f} % of the hand's size away from the model")
         if self.mask_iou < bounds.mask_iou:
-            broken.append(f"the model covers the hand's outline badly (IoU {self.mask_iou:.2f})")
+            broken.append(f"the model does not match the hand's outline (IoU {self.mask_iou:.2f})")
         if self.cost > bounds.cost:
-            broken.append(f"the landmarks and the outline contradict a plausible hand (cost {self.cost:.0f})")
+            broken.append(f"no plausible hand matches the landmarks and the outline (cost {self.cost:.0f})")
         return broken
 
     def warnings(self) -> list[str]:
@@ -155,8 +155,8 @@ def finger_warnings(target: FitTarget, detections: list[DetectedHand]) -> list[s
         gaps = [np.linalg.norm(found.xy[rows] - target.xy[rows], axis=1).mean() / target.box for found in detections]
         if gaps and min(gaps) > _FINGER_GAP:
             warnings.append(
-                f"{finger} {'' if finger == 'thumb' else 'finger '}doubtful: on a second look it lies "
-                f"{100 * min(gaps):.0f} % of the hand's size elsewhere"
+                f"{finger} {'' if finger == 'thumb' else 'finger '}doubtful: a second detection places it "
+                f"{100 * min(gaps):.0f} % of the hand's size away"
             )
     return warnings
 
@@ -176,11 +176,11 @@ def stray_pixels(
         own = stray[finger == number]
         if len(own) >= _MIN_PIXELS and own.mean() > _STRAY_FINGER:
             warnings.append(
-                f"{name} {'' if name == 'thumb' else 'finger '}doubtful: {100 * own.mean():.0f} % of its pixels lie "
-                "elsewhere on the fitted hand"
+                f"{name} {'' if name == 'thumb' else 'finger '}doubtful: {100 * own.mean():.0f} % of its pixels "
+                "do not match the fitted hand"
             )
     if stray.mean() > _STRAY_WARNED:
-        warnings.insert(0, f"poor fit: {100 * stray.mean():.0f} % of the hand's pixels lie elsewhere on the model")
+        warnings.insert(0, f"poor fit: {100 * stray.mean():.0f} % of the hand's pixels do not match the model")
     return float(stray.mean()), warnings
 
 
@@ -202,9 +202,9 @@ def side_warnings(side: str, cost: float, other_cost: float, detections: list[De
     ratio, warnings = other_cost / max(cost, 1e-9), []
     other = "left" if side == "right" else "right"
     if ratio < _SIDE_RATIO:
-        warnings.append(f"side doubtful: the landmarks of a {other} hand would cost {ratio:.2f} times as much")
+        warnings.append(f"side doubtful: as a {other} hand, the fit costs only {ratio:.2f} times as much")
     if detections and max(found.right for found in detections) < 0.5:
-        warnings.append(f"side doubtful: on a second look the network sees a {other} hand")
+        warnings.append(f"side doubtful: a second detection sees a {other} hand")
     return warnings
 
 
@@ -213,12 +213,12 @@ def framing_warnings(target: FitTarget, mask: np.ndarray) -> list[str]:
     warnings = []
     if target.box < SMALL_HAND:
         low = target.box < LOW_DETAIL
-        what = "has little detail and its pose may be off" if low else f"will be blurred below {SMALL_HAND}"
-        warnings.append(f"small hand: {target.box:.0f} pixels, the avatar {what}")
+        what = "the avatar has little detail and its pose may be wrong" if low else "the avatar will be blurred"
+        warnings.append(f"small hand: {target.box:.0f} pixels, less than {SMALL_HAND}; {what}")
     width, height = target.size
     hand = (mask > 0.5) & wrist_line(target.xy).above_mask(target.size)
     touching = sum(int(line.sum()) for line in (hand[0], hand[-1], hand[:, 0], hand[:, -1]))
     outside = bool(((target.xy < 0) | (target.xy > [width, height])).any())
     if outside or touching > _BORDER * target.box:
-        warnings.append("the hand is cut by the photo's border: what lies outside is guessed")
+        warnings.append("the photo's border cuts the hand: the part outside is guessed")
     return warnings

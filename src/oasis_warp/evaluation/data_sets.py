@@ -182,7 +182,7 @@ def evaluate_data_set(
     left_out = {**data.left_out, **{name: why for one in found for name, why in one["left_out"].items()}}
     if not pictures:
         first = next(iter(left_out.values()), "it has no pictures")
-        raise InputError(f"{out}: of no picture of the data set could an avatar be made: {first}")
+        raise InputError(f"{out}: no avatar could be made from any picture of the data set: {first}")
     strips = [path for photo, _ in chosen if (path := out / AVATARS / f"{photo.file}.png").exists()]
     write_sheet(out / SHEET, strips, ["photo", "truth", *(row.name for row in rows)])
     maps = [path for photo, _ in chosen if (path := out / AVATARS / f"{photo.file}{ATTENTION_END}").exists()]

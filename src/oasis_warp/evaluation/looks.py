@@ -99,7 +99,7 @@ def evaluate_looks(
         found[path.name] = {name: value for name, value in made.items() if name != "features"}
     progress("avatars", len(photos), len(photos))
     if not found:
-        raise InputError(f"{folder}: of no photo an avatar can be made; see {out / AVATARS}.")
+        raise InputError(f"{folder}: no avatar could be made from any photo; see {out / AVATARS}.")
     write_overview(out / OVERVIEW, [out / SHEETS / f"{Path(name).stem}.jpg" for name in found], IN_OVERVIEW)
     whole = {
         "settings": settings,

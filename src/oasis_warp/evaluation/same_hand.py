@@ -228,7 +228,7 @@ def evaluate_photos(
     found = [json.loads((out / HANDS / f"{name}.json").read_bytes()) for name in hands]
     pairs = [pair for hand in found for pair in hand["pairs"]]
     if not pairs:
-        raise InputError(f"{folder}: of no hand are there two photos that avatars can be made of; see {out / HANDS}.")
+        raise InputError(f"{folder}: no hand has two photos from which avatars could be made; see {out / HANDS}.")
     strips = [path for name in hands if (path := out / HANDS / f"{name}.png").exists()]
     write_sheet(out / SHEET, strips, ["looks of", "pose of", *map(method_name, methods)])
     left_out = {name: why for hand in found for name, why in hand["left_out"].items()}

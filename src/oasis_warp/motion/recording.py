@@ -36,7 +36,7 @@ def follow_video(path: Path, avatar: Avatar, *, progress: Progress = silent) -> 
             "video of the whole hand in good light, or an avatar of the other side."
         )
     if len(seen) < len(poses):
-        logger.warning("%s: no %s hand in frames %s of %d; bridged", path, avatar.side, _listed(poses), len(poses))
+        logger.warning("%s: no %s hand in frames %s of %d; interpolated", path, avatar.side, _listed(poses), len(poses))
     shaken = bridged(poses, fps)
     motion = smooth(shaken)
     before, after = (_jitter(avatar, each) for each in (shaken, motion))

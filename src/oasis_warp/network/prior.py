@@ -219,7 +219,7 @@ def guess_with_heads(prior: Prior, crop: HandCrop) -> tuple[CanonicalGaussians, 
     """
     if not isinstance(prior, NetworkPrior):
         raise InputError(
-            f"prior {prior.about['name']!r}: has no heads for LoRA to train; choose a learned one, or the field."
+            f"prior {prior.about['name']!r}: has no heads that LoRA can train; use a learned prior, or the field."
         )
     return prior.with_heads(crop)
 
@@ -239,12 +239,12 @@ def choose_prior(choice: Literal["learned", "none"] | Path, backbone_weights: Pa
     if isinstance(choice, Path):
         backbone = read_header(choice)["config"].get("backbone")
         if backbone_weights is not None and backbone == "convolutional":
-            raise InputError(f"{choice}: reads photos with an encoder of its own; leave out the backbone's weights.")
+            raise InputError(f"{choice}: does not use backbone weights; leave out --backbone-weights.")
         return NetworkPrior(
             load_network(choice, bundled_hand(), backbone_weights=backbone_weights), _identity(str(choice), choice)
         )
     if backbone_weights is not None:
-        raise InputError(f"{backbone_weights}: the prior {choice!r} has no use for a backbone's weights; leave it out.")
+        raise InputError(f"the prior {choice!r}: does not use backbone weights; leave out --backbone-weights.")
     if choice == "learned":
         return bundled_prior()
     if choice == "none":

@@ -135,11 +135,11 @@ def _opened(path: Path) -> AbstractContextManager[Any]:
 def _checked_header(path: Path, file: Any) -> dict[str, Any]:
     header = read_entry(path, file, FORMAT, "copy it again")
     if header is None:
-        raise InputError(f"{path}: a safetensors file, but no network of ours; give the one `oasis pretrain` wrote.")
+        raise InputError(f"{path}: a safetensors file, but not a network; give one that `oasis pretrain` wrote.")
     version = header.get("version")
     if type(version) is int and version > VERSION:
         raise InputError(
-            f"{path}: a network of version {version}, but {VERSION} is the last known here; update oasis-warp."
+            f"{path}: a network of version {version}, newer than the known {VERSION}; update oasis-warp."
         )
     wrong = [key for key, kind in HEADER.items() if type(header.get(key)) is not kind]
     if wrong or version != VERSION:

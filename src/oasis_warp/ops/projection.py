@@ -65,7 +65,7 @@ def check_values(
     if quats is not None:
         zeros = int((quats.detach() == 0).all(-1).sum())
         if zeros:
-            raise ValueError(f"quats: expected rows that are not zero, got {zeros} zero rows. (1, 0, 0, 0) is no turn.")
+            raise ValueError(f"quats: expected nonzero rows, got {zeros} zero rows. (1, 0, 0, 0) is the identity.")
     if covars is not None:
         negative = int((covars.detach().diagonal(dim1=-2, dim2=-1) < 0).any(-1).sum())
         if negative:

@@ -4,13 +4,13 @@
 const KEY = "oasis-photos";
 const PAUSE = 1000; // ms between two looks at a photo that is not done
 const LINKS = [
-  ["turn and pose it", "hand.html"],
+  ["3D page", "hand.html"],
   ["summary", "summary.png"],
-  ["what the photo shows", "quality.png"],
+  ["seen and guessed skin", "quality.png"],
   ["mesh for engines (.glb)", "hand.glb"],
   ["splats (.ply)", "hand.ply"],
   ["splats (.spz)", "hand.spz"],
-  ["avatar", "avatar.safetensors"],
+  ["avatar file", "avatar.safetensors"],
 ];
 
 const list = document.getElementById("jobs");
@@ -56,7 +56,7 @@ async function watch(item, job) {
       continue;
     }
     bar.hidden = found.state === "done" || found.state === "failed";
-    if (found.state === "waiting") state.textContent = found.ahead ? `waiting, ${found.ahead} before it` : "waiting";
+    if (found.state === "waiting") state.textContent = found.ahead ? `waiting for ${found.ahead} other${found.ahead > 1 ? "s" : ""}` : "waiting";
     if (found.state === "running") state.textContent = found.note;
     if (found.state === "failed") state.textContent = `No avatar: ${found.note}`;
     if (found.state === "done") {

@@ -135,9 +135,9 @@ function fillLooks(viewer) {
 function noteOn(look, facts) {
   if (look === "map") {
     const swatch = (kind) => make("span", { className: `swatch ${kind}` });
-    return [swatch("seen"), "seen in a photo", swatch("invented"), "painted"];
+    return [swatch("seen"), "seen in a photo", swatch("invented"), "inpainted"];
   }
-  if (look === "even") return [facts.lights.photo ? "No light of the photo." : "Light and shadows of the photo are part of the skin."];
+  if (look === "even") return [facts.lights.photo ? "Even light, without the light of the photo." : "Light and shadows of the photo are part of the skin."];
   return [{ photo: "The photo's own light, with the shadows that the hand casts on itself.", studio: "Three large lamps." }[look]];
 }
 

@@ -58,7 +58,7 @@ _temporary: list[tempfile.TemporaryDirectory[str]] = []
 def _temporary_cache(why: str) -> Path:
     _temporary.append(tempfile.TemporaryDirectory(prefix="oasis_warp_kernels_"))
     warnings.warn(
-        f"the kernel cache cannot be used ({why}); kernels are compiled anew in every run, into {_temporary[-1].name}. "
+        f"the kernel cache cannot be used ({why}); every run compiles kernels again, into {_temporary[-1].name}. "
         "Set OASIS_WARP_CACHE to a folder that can be written.",
         RuntimeWarning,
         stacklevel=2,

@@ -115,7 +115,7 @@ def _load() -> Any | None:
         return module
     except (NotBuiltError, ImportError, OSError) as error:
         warnings.warn(
-            f"The C++ node of pictures cannot be used ({_reason(error)}); the node in Python draws the same.",
+            f"The C++ node for rasterization cannot be used ({_reason(error)}); the Python node gives the same result.",
             RuntimeWarning, stacklevel=2,
         )  # fmt: skip
         return None

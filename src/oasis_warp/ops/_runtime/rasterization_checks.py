@@ -44,12 +44,12 @@ def check_cameras(
     if n_cameras * width * height > MAX_PIXELS:
         raise ValueError(
             f"width: expected at most {MAX_PIXELS} pixels in all images, got {n_cameras} x {height} x {width}. "
-            "Draw fewer cameras a call."
+            "Draw fewer cameras per call."
         )
     if n_cameras * len(means) > MAX_GAUSSIANS:
         raise ValueError(
             f"means: expected at most {MAX_GAUSSIANS} Gaussians for all cameras, got {n_cameras} x {len(means)}. "
-            "Draw fewer cameras a call."
+            "Draw fewer cameras per call."
         )
     check_positive("near_plane", near_plane)
     for name, value in (("far_plane", far_plane), ("radius_clip", radius_clip), ("eps2d", eps2d)):
