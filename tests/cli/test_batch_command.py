@@ -190,7 +190,8 @@ def test_the_work_of_a_cluster_is_counted_and_a_lost_scheduler_told(pipeline, ph
     distributed = pytest.importorskip("distributed")
     names = [photo(f"{k}.png", shade) for k, shade in enumerate((9, 1, 10))]
     reports = []
-    with distributed.Client(processes=False, n_workers=2, threads_per_worker=1, dashboard_address=None) as client:
+    workers = {"processes": False, "n_workers": 2, "threads_per_worker": 1}
+    with distributed.Client(**workers, dashboard_address="127.0.0.1:0") as client:  # 8787 may be taken
         tasks = [names[:2], names[2:]]
         assert batch.work(client, tasks, order, lambda *counts: reports.append(counts)) == 3
         assert reports[-1] == (3, 0)

@@ -51,13 +51,14 @@ class Cluster:
             dask = [sys.executable, "-m", "distributed.cli."]
             file = out.parent / "scheduler.json"
             file.unlink(missing_ok=True)
-            self._start([f"{dask[-1]}dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard",
+            web = ["--no-dashboard", "--dashboard-address", "127.0.0.1:0"]  # other schedulers run beside this one
+            self._start([f"{dask[-1]}dask_scheduler", "--host", "127.0.0.1", "--port", "0", *web,
                          "--scheduler-file", str(file)])  # fmt: skip
             while not file.is_file():
                 time.sleep(0.1)
             address = json.loads(file.read_text())["address"]
             for _ in range(2):
-                self._start([f"{dask[-1]}dask_worker", address, "--nthreads", "1", "--no-dashboard"])
+                self._start([f"{dask[-1]}dask_worker", address, "--nthreads", "1", *web])
             where = ["--scheduler", address]
         command = [sys.executable, "-m", "oasis_warp", "batch", str(photos), "-o", str(out), *QUICK, *where]
         self.client = psutil.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
