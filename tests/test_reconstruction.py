@@ -93,7 +93,7 @@ def test_options_are_checked_before_any_work_from_python_too(options, message):
 
 
 def test_lora_is_for_one_photo():
-    with pytest.raises(InputError, match="adapt lora: learns one photo, got 2; leave it out"):
+    with pytest.raises(InputError, match="adapt lora: works with one photo, got 2; leave it out"):
         reconstruct_same_hand([read_photo(path) for path in (PALM, BACK)], replace(SMALL, adapt="lora"))
 
 

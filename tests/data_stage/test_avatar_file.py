@@ -221,7 +221,7 @@ def test_no_memory_is_taken_for_more_gaussians_than_a_hand_can_have(tmp_path):
 
 def test_another_safetensors_file_is_no_avatar(tmp_path):
     save_file({"weight": torch.zeros(2)}, tmp_path / "net.safetensors")
-    with pytest.raises(InputError, match="no avatar"):
+    with pytest.raises(InputError, match="a safetensors file, but not an avatar"):
         load_avatar(tmp_path / "net.safetensors")
 
 

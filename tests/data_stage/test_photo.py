@@ -196,7 +196,7 @@ def test_a_jpeg_cut_short_and_closed_again_is_refused(read):
     ("data", "expected"),
     [
         (b"", "empty file"),
-        (b"These are words.", "no image"),
+        (b"These are words.", "got a file that is not an image"),
         (b"\0\0\0\x18ftypheic\0\0\0\0" + b"\0" * 100, "got HEIC; save the photo as JPEG"),
         (b"\0\0\0\x18ftypisom\0\0\0\0" + b"\0" * 100, "got video"),
         (b"GIF89a" + b"\0" * 100, "got GIF"),
