@@ -134,7 +134,7 @@ def run(options: Options) -> list[Row]:
     hands.bake(hands.people_met(0, 1, options.steps), baked, options.workers, report)
     for name in options.only or everything:
         if not train(name, hands, folder / name, options, deadline):
-            print("stopped for lack of time; the same command goes on.", file=sys.stderr)
+            print("stopped for lack of time; the same command continues.", file=sys.stderr)
             return []
     if options.only:
         return []

@@ -27,7 +27,7 @@ LITTLE_SEEN = 20.0
 """Share of the surface below which the photo shows little of it [%]: 25 to 38 on fifteen photos of whole hands."""
 DARK, CLIPPED, CLIP = 0.15, 0.1, 0.99
 """Mean brightness of a hand that is too dark; share of its pixels at the upper end, from CLIP on, that is too many."""
-BLURRED, BLUR_SIDE, BLUR_WINDOW = 0.75, 512, 9
+BLURRED, BLUR_SIDE, BLUR_WINDOW = 0.70, 512, 9
 """Blur [0 to 1] from which a photo counts as blurred, side of the crop at which it is measured, at most, and length of
 the test's own blur [px]. Fifteen hands of 206 to 562 px have .41 to .62, and blurred by 2 px .74 and more."""
 LUMA = (0.299, 0.587, 0.114)
