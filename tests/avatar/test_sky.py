@@ -4,6 +4,7 @@ import pytest
 import torch
 from synthetic import as_left_hand, avatar_of, crop_of
 
+from oasis_warp.avatar import pose as posing
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.pose import (
     Lighting,
@@ -212,6 +213,20 @@ def test_an_older_file_looks_as_before_in_its_photo_and_gains_elsewhere(hand, sc
         source, opened = avatar.source_pose, avatar.source_pose._replace(angles=named_pose(hand, "pinch"))
         torch.testing.assert_close(read.pose(source).colors, avatar.pose(source).colors, atol=1e-3, rtol=0)
         assert float((read.pose(opened).colors / avatar.pose(opened).colors).min()) < 0.8
+
+
+def test_a_file_without_light_through_the_skin_looks_as_before_in_its_photo(hand, scene, tmp_path, monkeypatch):
+    crop, truth, pose = scene
+    old = avatar_of(hand, truth, pose, crop.camera, EVEN)
+    old.save(tmp_path / "today.safetensors")
+    with monkeypatch.context() as before:
+        before.setattr(avatar_file, "VERSION", 6)
+        before.setattr(posing, "arriving", bounced)
+        old.save(tmp_path / "old.safetensors")
+        wanted = old.pose(old.source_pose).colors
+    read, unchanged = (Avatar.load(tmp_path / f"{name}.safetensors") for name in ("old", "today"))
+    torch.testing.assert_close(read.pose(old.source_pose).colors, wanted, atol=1e-3, rtol=0)
+    assert float((unchanged.pose(old.source_pose).colors - wanted).max()) > 0.01
 
 
 def test_detail_that_takes_back_a_shadow_is_no_white_skin(hand, scene):

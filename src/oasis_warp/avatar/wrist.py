@@ -36,11 +36,11 @@ CAP_RINGS = 20
 MIRRORED = 0.05
 """The stretch of skin before the rim whose detail the end of the wrist repeats in the mirror [m]."""
 AVERAGED = 32
-"""Gaussians of that skin from whose mean each one's detail is what is left: 3 to 6 mm around."""
+"""Number of nearest Gaussians of that skin, 3 to 6 mm around; detail is the difference of one from their mean."""
 DARKEST = 0.02
 """Colours are clamped to it before their logarithm is taken [sRGB]."""
 LOUDEST = 0.06
-"""Largest logarithm of that detail, three times what the finest of real backs has: more is a shadow or a sleeve."""
+"""Largest logarithm of that detail, three times the finest contrast of real backs: more is a shadow or a sleeve."""
 RIM_PARTS = -1 / 3, 0.0, 1 / 3
 """Places of Gaussians along the edges at a vertex of the rim, as shares of the edge: one on each vertex makes teeth."""
 RIM_SPREAD = 0.8
@@ -151,8 +151,9 @@ def _nearest(points: Float[Tensor, "M D"], among: Float[Tensor, "N D"], count: i
 
 
 def rim_axis(rest: Float[Tensor, "V 3"], rim: Int[Tensor, "R"]) -> Float[Tensor, "3"]:
-    """The direction in which the arm would go on: the normal of the rim, away from the hand."""
-    arms, middle = rest[rim] - rest[rim].mean(0), rest[rim].mean(0)
+    """Direction in which the arm would continue: the normal of the rim, away from the hand."""
+    middle = rest[rim].mean(0)
+    arms = rest[rim] - middle
     axis = normalize(torch.linalg.cross(arms, arms.roll(-1, 0)).sum(0), dim=0)
     return axis * torch.sign((axis * (middle - rest.mean(0))).sum())
 
@@ -174,8 +175,8 @@ def rim_cap(
 ) -> tuple[Int[Tensor, "M"], Float[Tensor, "M 3"], Float[Tensor, "M 4"], Float[Tensor, "M 3"]]:
     """Vertex Gaussians that close the open end: vertices of the rim, offsets, quaternions and scales [m].
 
-    With arms a from the middle of the rim to its points, p = cos(f) a + sin(f) h: half an ellipsoid, which goes on from
-    the skin without an edge. Rings of equal steps of f have points as far apart as they are from each other.
+    With arms a from the middle of the rim to its points, p = cos(f) a + sin(f) h: half an ellipsoid, which continues
+    the skin without an edge. Points of a ring are as far apart as the rings.
     """
     edge, center, n = rest[rim], rest[rim].mean(0), len(rim)
     arms, axis = edge - center, rim_axis(rest, rim)
