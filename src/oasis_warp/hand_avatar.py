@@ -163,8 +163,8 @@ class Avatar:
 
     def _resolve_contact(self, vertices: Float[Tensor, "*B V 3"], pose: HandPose) -> Float[Tensor, "*B V 3"]:
         """Posed vertices after contact: nothing gives way in the photo's pose, whose colours were learned there."""
-        bent = (pose.angles.detach() - self._source_angles).abs().amax((-2, -1))
-        return resolve_contact(self.hand, vertices, self.side, bent)
+        changes = (pose.angles.detach() - self._source_angles).flatten(-2)
+        return resolve_contact(self.hand, vertices, self.side, changes)
 
     def mesh(self, pose: HandPose | str, *, validate: bool = True) -> PosedHand:
         """The surface that carries Gaussians, in `pose` [m]; the faces of a left hand wind the other way.

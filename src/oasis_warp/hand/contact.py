@@ -38,7 +38,7 @@ def resolve_contact(
     hand: HandModel,
     vertices: Float[Tensor, "*B V 3"],
     side: Side = "right",
-    bent: Float[Tensor, "*B"] | None = None,
+    changes: Float[Tensor, "*B K"] | None = None,
 ) -> Float[Tensor, "*B V 3"]:
     """Move posed vertices of a hand out of each other: both sides of a contact yield, each by at most `LIMIT`.
 
@@ -50,16 +50,16 @@ def resolve_contact(
         hand: Model of the surface.
         vertices: In poses [m].
         side: The faces of a left hand wind the other way.
-        bent: Largest change of an angle [rad] from a pose in which nothing gives way; from `FREE` on it does wholly.
+        changes: Changes of angles [rad] from a pose in which nothing gives way; from `FREE` on it does wholly.
     """
-    if bent is not None and bent.is_cpu and not bent.any():
-        return vertices
+    if changes is not None:
+        if changes.is_cpu and not changes.any():
+            return vertices
+        changes = changes.detach().float().reshape(-1, changes.shape[-1])
     flat = vertices.detach().float().reshape(-1, *vertices.shape[-2:])
-    shifts = contact_shifts(flat, hand.faces, contact_tables(vertices.device), side == "left")
-    if shifts is None:
-        return vertices
-    moved = shifts.to(vertices).view_as(vertices)
-    return vertices + (moved if bent is None else (bent / FREE).clamp(max=1)[..., None, None] * moved)
+    tables = contact_tables(vertices.device)
+    shifts = contact_shifts(flat, hand.faces, tables, side == "left", changes, FREE)
+    return vertices if shifts is None else vertices + shifts.to(vertices).view_as(vertices)
 
 
 @functools.cache

@@ -7,9 +7,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from oasis_kernels.skinning import contact as kernels
+from oasis_kernels.skinning import contact_cuda
 from oasis_warp.ops._runtime.declaration import Array, Declaration
-from oasis_warp.ops._runtime.incidence import incidence
-from oasis_warp.ops._runtime.launch import even_cuts, launch_ranges, vectors
+from oasis_warp.ops._runtime.incidence import Incidence, incidence
+from oasis_warp.ops._runtime.launch import (
+    aligned, block_count, current_stream, even_cuts, launch_ranges, run_cuda, vectors,
+)  # fmt: skip
 
 GROUP = 32
 """Parts of a group: bits of a word."""
@@ -29,6 +32,8 @@ PAD = 0.003
 """Margin around a part's box [m]: normals of the flesh below differ from the part's own and lead that far aside."""
 MIN_PARTS = 64
 """Least parts for which another thread pays."""
+MAX_SURFACES = 1024
+"""Surfaces of a launch on CUDA, at most: Warp counts threads in 32 bits."""
 
 
 class ContactTables(NamedTuple):
@@ -57,13 +62,20 @@ class ContactTables(NamedTuple):
 
 
 _CONTACT = Declaration(
-    "contact_shifts", inputs={"vertices": Array("B V 3"), "faces": Array("F 3", index="V")}, public=False
+    "contact_shifts",
+    inputs={"vertices": Array("B V 3"), "faces": Array("F 3", index="V"), "changes": Array("B K", optional=True)},
+    public=False,
 )
 
 
 @torch.no_grad()
 def contact_shifts(
-    vertices: Float[Tensor, "B V 3"], faces: Int[Tensor, "F 3"], tables: ContactTables, mirrored: bool
+    vertices: Float[Tensor, "B V 3"],
+    faces: Int[Tensor, "F 3"],
+    tables: ContactTables,
+    mirrored: bool,
+    changes: Float[Tensor, "B K"] | None = None,
+    whole: float = 1.0,
 ) -> Float[Tensor, "B V 3"] | None:
     """Shifts that lead the vertices of posed surfaces out of other parts of the same surface; None if nothing touches.
 
@@ -77,18 +89,35 @@ def contact_shifts(
         faces: Corners.
         tables: Tables of that surface.
         mirrored: Whether faces wind the other way.
+        changes: Changes from a pose in which nothing gives way: shifts are those times the largest one over `whole`.
+        whole: Largest change from which on everything gives way.
 
     Raises:
         ValueError: a wrong shape or index.
     """
-    n = _CONTACT.check(vertices=vertices, faces=faces)["V"]
-    t, index = tables, incidence("faces", faces, n, "vertices")
-    batch, n_parts, n_groups = len(vertices), *t.allowed.shape
+    n = _CONTACT.check(vertices=vertices, faces=faces, changes=changes)["V"]
+    index, outward = incidence("faces", faces, n, "vertices"), -1.0 if mirrored else 1.0
+    if vertices.is_cuda:
+        parts = []
+        for k in range(0, len(vertices), MAX_SURFACES):
+            some, by = aligned(*(None if t is None else t[k : k + MAX_SURFACES] for t in (vertices, changes)))
+            parts.append(_shifts_on_cuda(some, index, tables, outward, by, whole))
+        return torch.cat(parts) if len(parts) != 1 else parts[0]
+    shifts = _shifts_on_cpu(vertices.contiguous(), index, tables, outward)
+    if shifts is None or changes is None:
+        return shifts
+    return (changes.abs().amax(1) / whole).clamp(max=1)[:, None, None] * shifts
+
+
+def _shifts_on_cpu(
+    vertices: Float[Tensor, "B V 3"], index: Incidence, t: ContactTables, outward: float
+) -> Float[Tensor, "B V 3"] | None:
+    batch, n, n_parts, n_groups = *vertices.shape[:2], *t.allowed.shape
 
     def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
         return vertices.new_empty((batch, *shape), dtype=dtype)
 
-    points, outward = vectors(vertices.contiguous(), 2), -1.0 if mirrored else 1.0
+    points = vectors(vertices, 2)
     corners, groups = vectors(empty(n_parts, 5, 3), 3), vectors(empty(n_groups, 2, 3), 3)
     met, state = empty(n_parts, n_groups, dtype=torch.int32), empty(n_parts, dtype=torch.int32)
     any_met = torch.zeros_like(state)
@@ -98,7 +127,7 @@ def contact_shifts(
     launch_ranges(kernels.group_boxes, batch * n_groups, [corners, groups], vertices)
     pairs = even_cuts(batch * n_parts * n_groups, MIN_PARTS * n_groups)
     launch_ranges(kernels.meetings, pairs, [corners, groups, t.allowed, PARTS_OPPOSED, met, any_met], vertices)
-    if vertices.is_cpu and not any_met.any():
+    if not any_met.any():
         return None
     launch_ranges(kernels.reached, cuts, [any_met, t.beside, state], vertices)
     others, around, normals = empty(n, dtype=torch.int32), [t.offsets, t.neighbours], vectors(empty(n, 3), 2)
@@ -110,9 +139,46 @@ def contact_shifts(
         before, after, leads = vectors(shifts, 2), empty(n, 3), vectors(wanted, 2)
         given = [points, before, normals, others, *around, t.give, OPPOSED, ASIDE, MARGIN, leads]
         launch_ranges(kernels.contacts, batch * n, given, vertices)
-        if k == 0 and vertices.is_cpu and not wanted[..., 3].any():
+        if k == 0 and not wanted[..., 3].any():
             return None
         given = [leads, before, t.part, state, *around, t.weights, t.give, FADES, vectors(after, 2)]
         launch_ranges(kernels.spread, batch * n, given, vertices)
         shifts = after
     return shifts
+
+
+def _shifts_on_cuda(
+    vertices: Float[Tensor, "B V 3"], index: Incidence, t: ContactTables, outward: float,
+    changes: Float[Tensor, "B K"] | None, whole: float,
+) -> Float[Tensor, "B V 3"]:  # fmt: skip
+    batch, n, n_parts, n_groups = *vertices.shape[:2], *t.allowed.shape
+
+    def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        return vertices.new_empty((batch, *shape), dtype=dtype)
+
+    one_block = contact_cuda.WARPS
+    box_blocks, rows = block_count(batch * n_parts, one_block), block_count(batch * n, one_block)
+    params = t._asdict() | {
+        "batch": batch, "n": n, "n_parts": n_parts, "n_groups": n_groups, "reach": DEEPEST, "points": vertices,
+        "boxes": empty(5, n_parts, 4), "normals": empty(n, 3), "met": empty(n_parts, n_groups, dtype=torch.int32),
+        "state": empty(n_parts, dtype=torch.int32), "others": empty(n, dtype=torch.int32), "wanted": empty(n, 4),
+        "aside": ASIDE, "margin": MARGIN, "fades": FADES, "whole": whole, "shifts": None,
+    }  # fmt: skip
+    stream = current_stream(vertices.device)
+    surface = {
+        "box_blocks": box_blocks, "offsets": index.offsets, "entries": index.entries, "faces": index.table,
+        "n_samples": t.samples.shape[1], "outward": outward, "pad": PAD,
+    }  # fmt: skip
+    vertex_blocks = block_count(batch * n, contact_cuda.BLOCK)
+    run_cuda(contact_cuda.boxes, params | surface, box_blocks + vertex_blocks, stream)
+    near = {"n_beside": t.beside.shape[1], "opposed": PARTS_OPPOSED}
+    run_cuda(contact_cuda.meetings, params | near, box_blocks, stream)
+    params["opposed"] = OPPOSED
+    for k in range(ROUNDS):
+        run_cuda(contact_cuda.contacts, params, rows, stream)
+        last = changes is not None and k == ROUNDS - 1
+        params |= {"changes": changes if last else None, "n_changes": changes.shape[1] if last else 0}
+        params["out"] = empty(n, 3)
+        run_cuda(contact_cuda.spread, params, rows, stream)
+        params["shifts"] = params["out"]
+    return params["shifts"]

@@ -1,0 +1,21 @@
+"""Contact on CUDA: `contact.cu`, the rules of `contact`, by warps."""
+
+from oasis_kernels.runtime.cuda_native import CudaNative, cuda_native
+
+BLOCK = 128
+"""Threads of a block."""
+WARPS = BLOCK // 32
+
+
+def _build(name: str, label: str) -> CudaNative:
+    return cuda_native("skinning/contact.cu", name, BLOCK, label=label)
+
+
+boxes = _build("boxes", "contact_boxes")
+"""Kernel: `box_blocks` blocks with a warp for each part of each image, then one for every `BLOCK` vertices of all."""
+meetings = _build("meetings", "contact_meetings")
+"""Kernel: a warp for each part of each image."""
+contacts = _build("contacts", "contacts")
+"""Kernel: a warp for each vertex of each image."""
+spread = _build("spread", "contact_spread")
+"""Kernel: a warp for each vertex of each image."""
