@@ -168,8 +168,7 @@ def test_streams_and_threads_give_the_same_bits(on_and_off):
 
 @pytest.mark.gpu
 @pytest.mark.filterwarnings("ignore:.torch.jit.script_method:DeprecationWarning")  # which torch.compile itself uses
-@pytest.mark.filterwarnings("ignore:Dynamo detected a call to a .functools.lru_cache:UserWarning")  # of the type checks
-def test_graphs_and_compiled_calls_go_round_the_node(extension):
+def test_graphs_and_compiled_calls_go_round_the_node(extension, as_shipped):
     given = scene(300, 1, 3)
     expected = rasterization(**given, width=WIDTH, height=HEIGHT, validate=False)[0]
 
