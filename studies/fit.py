@@ -29,7 +29,7 @@ from oasis_warp.ops import depth_map
 from oasis_warp.synthetic.picture import render_batch
 from oasis_warp.synthetic.shots import PICTURES_EACH
 from studies.harness import Row, StudyOptions, measured
-from studies.inputs import OUTLINES, PHOTOS, estimator, iou, photos_below, read_masks, synthetic_photo
+from studies.inputs import OUTLINES, PHOTOS, estimator, iou, mask_name, photos_below, read_masks, synthetic_photo
 from studies.stress import FAULTS, FaultyInput
 from studies.tables import Column, Section, complete, distribution, groups, mean, medians, percent, percentiles, table
 
@@ -38,7 +38,7 @@ MEASURES = (
     Column("worst point, % of the box", "worst_point", ".1f"),
     Column("mesh against mask, IoU above the wrist", "mesh_mask", ".3f"),
     Column("the same after the outline offsets", "moved_mask", ".3f"),
-    Column("mask against ten hand-drawn ones", "mask_drawn", ".3f"),
+    Column("mask against the hand-drawn ones", "mask_drawn", ".3f"),
 )
 TRUSTED, FEWEST = 0.8, 150
 """Confidence of a vertex's colour that counts, and vertices of a region that must be seen so well."""
@@ -138,10 +138,12 @@ def measure_photo(photo: Photo, kind: str, true: Tensor | None = None, side: str
         yield row
 
 
-def measure_real(path: Path, drawn: Path) -> list[Row]:
-    """The hands of a real photo."""
-    mask = read_masks(drawn).get(path.stem) if "same_hand" not in path.parts else None
-    return list(measure_photo(read_photo(path), "real", None if mask is None else torch.from_numpy(mask) > 0.5))
+def measure_real(path: Path, photos: Path, drawn: Path) -> list[Row]:
+    """The hands of a real photo in the folder `photos` or below."""
+    name = mask_name(path.relative_to(photos))
+    mask = read_masks(drawn).get(name)
+    true = None if mask is None else torch.from_numpy(mask) > 0.5
+    return [{**row, "photo": name} for row in measure_photo(read_photo(path), "real", true)]
 
 
 def measure_synthetic(number: int, seed: int, size: int) -> list[Row]:
@@ -171,7 +173,7 @@ def run(options: Options) -> list[Row]:
     """Measure every photo."""
     paths, rows = photos_below(options.photos), []
     if "fit" in options.parts:
-        cases = {str(path.relative_to(options.photos)): (path, options.drawn) for path in paths}
+        cases = {str(path.relative_to(options.photos)): (path, options.photos, options.drawn) for path in paths}
         rows += measured("fit", cases, measure_real, options)
     if "faults" in options.parts:
         some = paths[:: options.every]

@@ -78,7 +78,7 @@ def people(count: int, first: int = 0) -> range:
 
 
 def read_masks(path: str | Path, *, cut_at_wrist: bool = False) -> dict[str, Coverage]:
-    """Hand-drawn masks by photo name (file name without extension): the covered share of each pixel, float32 (H, W).
+    """Hand-drawn masks: the covered share of each pixel, float32 (H, W), by the photo's name as `mask_name` makes it.
 
     Coordinates of the outlines: x to the right, y down, in pixels of the photo; pixel (row i, column j) covers
     [j, j + 1) x [i, i + 1).
@@ -92,7 +92,12 @@ def read_masks(path: str | Path, *, cut_at_wrist: bool = False) -> dict[str, Cov
         ValueError: a polygon is neither "outer" nor "hole".
     """
     entries = json.loads(Path(path).read_text(encoding="utf-8"))
-    return {Path(entry["file"]).stem: _coverage(entry, cut_at_wrist) for entry in entries}
+    return {mask_name(entry["file"]): _coverage(entry, cut_at_wrist) for entry in entries}
+
+
+def mask_name(file: str | Path) -> str:
+    """The name of a photo's mask: its path below the folder of photos, without extension."""
+    return Path(file).with_suffix("").as_posix()
 
 
 def _coverage(entry: dict, cut_at_wrist: bool) -> Coverage:

@@ -11,6 +11,7 @@ import pytest
 
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import KNUCKLES
+from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.estimation.fit_problem import pixels_per_metre
 from oasis_warp.estimation.landmarks import Crop, read_crop
@@ -18,7 +19,7 @@ from oasis_warp.estimation.networks import drawn_hand, networks
 from oasis_warp.estimation.pixel_reading import SIDE, PixelReading
 from oasis_warp.estimation.segmentation import mask_from_alpha, mask_from_reading
 from oasis_warp.network.dense_network import ARM, FRONT, HAND
-from studies.inputs import _filled, read_masks
+from studies.inputs import PHOTOS, _filled, mask_name, read_masks
 
 
 def hand_side(xy, shape):
@@ -172,7 +173,7 @@ ROOT = Path(__file__).parents[2]
 OUTLINES = ROOT / "tests/data/masks/outlines.json"
 ENTRIES = json.loads(OUTLINES.read_text(encoding="utf-8"))
 
-every_photo = pytest.mark.parametrize("entry", ENTRIES, ids=lambda e: Path(e["file"]).stem)
+every_photo = pytest.mark.parametrize("entry", ENTRIES, ids=lambda e: mask_name(e["file"]))
 
 
 def write(tmp_path, polygons, wrist=((0.0, 0.0), (8.0, 0.0))):
@@ -210,9 +211,15 @@ def hands():
     return read_masks(OUTLINES, cut_at_wrist=True)
 
 
-def test_ten_photos_are_outlined_each_once(masks):
-    assert len(ENTRIES) == 10
-    assert list(masks) == sorted(Path(e["file"]).stem for e in ENTRIES)
+def test_fifteen_photos_are_outlined_each_once(masks):
+    assert len(ENTRIES) == 15
+    assert list(masks) == sorted(mask_name(e["file"]) for e in ENTRIES)
+
+
+@every_photo
+def test_an_outline_has_the_size_of_its_photo(entry):
+    height, width = read_photo(ROOT / PHOTOS / entry["file"]).rgb.shape[:2]
+    assert entry["size"] == [width, height]
 
 
 def test_a_figure_eight_is_found_to_cross_itself_and_a_square_with_straight_joints_is_not():
@@ -236,9 +243,9 @@ def test_an_outline_stays_within_its_photo(entry):
             assert (points >= 0).all() and (points <= entry["size"]).all()
 
 
-@pytest.mark.parametrize("name", ["ok_sign_left_10", "back_flat_right_04"])
+@pytest.mark.parametrize("name", ["ok_sign_left_10", "back_flat_right_04", "same_hand/b1_panel_right/03_o_shape"])
 def test_holes_lie_inside_the_outline_and_are_uncovered(name, masks):
-    (entry,) = (e for e in ENTRIES if Path(e["file"]).stem == name)
+    (entry,) = (e for e in ENTRIES if mask_name(e["file"]) == name)
     (outer,), (hole,) = (
         [_filled(points, masks[name].shape) for points in polygons_of(entry, kind)]
         for kind in ("outer", "hole")
@@ -249,7 +256,7 @@ def test_holes_lie_inside_the_outline_and_are_uncovered(name, masks):
 
 @every_photo
 def test_the_hand_covers_a_plausible_share_of_its_photo_and_most_of_what_was_drawn(entry, masks, hands):
-    name = Path(entry["file"]).stem
+    name = mask_name(entry["file"])
     whole, hand = masks[name], hands[name]
     assert whole.shape == hand.shape == tuple(entry["size"][::-1])
     assert 0.1 < hand.mean() < 0.5
