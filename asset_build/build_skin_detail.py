@@ -58,9 +58,11 @@ RIM = 3.0
 """Width of the islands' rims over which detail fades in: what lies beside them bled into them [texels]."""
 GREY, STEPS = 128, 400
 """Value of the maps that stands for none, and steps to one of the natural logarithm."""
-PEOPLE, LOUDEST_LINE = (3, 8), 2.0
-"""People of the synthetic world whose folds over the joints are taken, and the first one's veins; the strength of a
-line that is stored as 255. The photos' own folds are blurred on the backs."""
+PEOPLE, PALMS, LOUDEST_LINE = (3, 8), (4, 9), 2.0
+"""People of the synthetic world whose folds over the joints are taken, and the first one's veins; those whose palm's
+lines are taken; the strength of a line that is stored as 255. The photos' own lines are blurred."""
+PALM_LINES = {"crease": 1.4, "main": 1.35, "minor": 0.7, "halo": 0.3}
+"""How dark lines of the palm are, in units of a clear fold: as the synthetic world draws them, halved by sRGB."""
 AROUND_PASSES = 20
 """Smoothings over the mesh that leave the skin around, some 10 mm: half of what a knuckle of 17 mm stands out stays."""
 NAIL_REACH = 1.0
@@ -82,9 +84,10 @@ def main(folder: Path) -> None:
         detail = band_pass(hand, np.log(np.maximum(picture, DARKEST)), faces, places)
         stored = np.rint(GREY + STEPS * LOUDEST * np.tanh(gain * detail / LOUDEST)).clip(0, 255).astype(np.uint8)
         write(target / f"detail_{k}.png", spread_out(stored, faces >= 0))
-    people = [painted_lines(hand, number) for number in PEOPLE]
-    folds_and_veins = torch.stack([people[0]["fold"], people[1]["fold"], people[0]["vein"]], 1)
-    lines = 255 * resampled(folds_and_veins / LOUDEST_LINE, faces, places)
+    folds = [lines_on_back(hand, number) for number in PEOPLE]
+    palms = [lines_on_palm(hand, number) for number in PALMS]
+    drawn = [fold["fold"] + palm for fold, palm in zip(folds, palms, strict=True)]
+    lines = 255 * resampled(torch.stack([*drawn, folds[0]["vein"]], 1) / LOUDEST_LINE, faces, places)
     write(target / "lines.png", spread_out(np.rint(np.clip(lines, 0, 255)).astype(np.uint8), faces >= 0, fill=0))
     write(target / "nails.png", spread_out(nails(hand, faces, places), faces >= 0))
     write_relief(hand, target / "relief.npz")
@@ -94,9 +97,9 @@ def main(folder: Path) -> None:
 
 
 def write_relief(hand: HandModel, path: Path) -> None:
-    """The heights of the synthetic world's forms on the backs of hands above the skin around them, for each vertex."""
+    """The heights of the synthetic world's forms above the skin around them, for each vertex."""
     heights, edges = torch.from_numpy(relief_forms()).float(), mesh_edges(hand.faces)
-    stands_out = (heights - smooth_over_mesh(heights, edges, AROUND_PASSES)) * (1 - label_regions(hand).palm)[:, None]
+    stands_out = heights - smooth_over_mesh(heights, edges, AROUND_PASSES)
     np.savez_compressed(path, forms=np.rint(stands_out.T.numpy() / FORM_UNIT).clip(-127, 127).astype(np.int8))
     print(path.name, path.stat().st_size)
 
@@ -179,12 +182,23 @@ def light_around_bones(hand: HandModel, colors: np.ndarray) -> np.ndarray:
     return splu((sparse.diags_array(mass) + SMOOTH**2 * laplacian).tocsc()).solve(mass[:, None] * fitted)
 
 
-def painted_lines(hand: HandModel, number: int) -> dict[str, torch.Tensor]:
-    """The lines of one person of the synthetic world, clear ones, at its texels."""
+def lines_on_back(hand: HandModel, number: int) -> dict[str, torch.Tensor]:
+    """The lines of one person of the synthetic world, clear ones, at its texels; none on the palm."""
     person = sample_identity(hand, 0, number, Population(hair=0))._replace(knuckles=1.1, age=0.45)
-    lines, texels = draw_lines(plan_skin(person).lines, texels_on("cpu").grid), texels_on("cpu")
-    palm = ((texels.palm - 0.28) / 0.52).clamp(0, 1)
-    return {name: line * (1 - palm) for name, line in lines.items()}
+    lines = draw_lines(plan_skin(person).lines, texels_on("cpu").grid)
+    return {name: line * (1 - palm_share()) for name, line in lines.items()}
+
+
+def lines_on_palm(hand: HandModel, number: int) -> torch.Tensor:
+    """How dark the lines of one person's palm are, at its texels; 0 on the back."""
+    person = sample_identity(hand, 0, number, Population(hair=0))
+    lines = draw_lines(plan_skin(person).lines, texels_on("cpu").grid)
+    return palm_share() * sum(gain * lines[name] for name, gain in PALM_LINES.items())
+
+
+def palm_share() -> torch.Tensor:
+    """The share of palm at the synthetic world's texels."""
+    return ((texels_on("cpu").palm - 0.28) / 0.52).clamp(0, 1)
 
 
 def resampled(values: torch.Tensor, faces: np.ndarray, places: np.ndarray) -> np.ndarray:

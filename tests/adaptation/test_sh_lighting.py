@@ -10,7 +10,6 @@ from oasis_warp.adaptation.sh_lighting import (
     SKIN_DEVIATION,
     add_shade,
     fit_light,
-    limit_shade,
     mark_probability,
     split_albedo_shading,
     weighted_deviation,
@@ -134,17 +133,6 @@ def turn(pose, degrees):
 
 def same_light(a, b):
     return all(x is y is None or torch.equal(x, y) for x, y in zip(a, b, strict=True))
-
-
-def test_on_a_slant_shade_is_what_light_does_to_skin(hand, scene):
-    even, truth, *_ = scene
-    floor = truth._replace(shade=torch.tensor([1.0, 0.8, 0.2]).expand_as(truth.colors))
-    cosine = vertex_to_gaussians(observe(hand, even).facing[:, None], hand.faces, truth)[:, 0]
-    limited = limit_shade(hand, floor, [even], LIGHT).shade
-    assert limited is not None and floor.shade is not None
-    slanted, openly = cosine.abs() < 0.2, cosine > 0.9
-    assert float(limited[slanted].log().std(1).median()) < 0.12 < 0.7 < float(floor.shade[0].log().std())
-    torch.testing.assert_close(limited[openly], floor.shade[openly])
 
 
 def in_shade(hand, even, truth, of):

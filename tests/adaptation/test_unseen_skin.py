@@ -11,8 +11,8 @@ from oasis_warp.adaptation import reliability
 from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.adaptation.inpainting import FADE_LENGTH, inpaint, laplacian_and_mass
 from oasis_warp.adaptation.reliability import mask_unreliable
-from oasis_warp.adaptation.skin_detail import Places, relief_on_back, sample_detail
-from oasis_warp.adaptation.unseen_skin import MORE, SEEN, infer_tone, paint_unseen, tone_colors
+from oasis_warp.adaptation.skin_detail import Places, flush_shade, relief, sample_detail
+from oasis_warp.adaptation.unseen_skin import MORE, SEEN, _clarities, infer_tone, paint_unseen, tone_colors
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.densify import coarsen
@@ -73,17 +73,38 @@ def test_the_unseen_back_gets_detail_that_a_mean_has_not(hand, palm_photo, paint
     assert detail_of(hand, after, where) > 1.5 * detail_of(hand, before, where)
 
 
-def test_knuckles_stand_out_of_an_unseen_back_and_the_palm_has_none():
-    """Painted backs were slabs: detail of 4 to 8 px, where tendons and knuckles are, was at .4 of real hands'."""
+def test_knuckles_and_pads_stand_out_of_unseen_skin():
+    """Painted hands were slabs: detail of 4 to 8 px, where tendons and pads are, was at .4 of real hands'."""
     hand = bundled_hand()
-    palm, n = label_regions(hand).palm, len(hand.template)
-    first, other = (relief_on_back(seed, n) for seed in (0, 1))
+    palm = label_regions(hand).palm
+    first, other = (relief(hand, seed) for seed in (0, 1))
     at_knuckle = (hand.template - hand.joints[MIDDLE]).norm(dim=1)
     knuckle = first[(at_knuckle < 0.015) & (palm < 0.05)].max()
     between = first[(hand.template - hand.joints[[RING, MIDDLE]].mean(0)).norm(dim=1) < 0.015].min()
     assert float(knuckle) > 0.2 and float(between) < -0.2
-    assert float(first[palm > 0.999].abs().max()) < 0.01
-    assert not torch.equal(first, other) and torch.equal(first, relief_on_back(0, n))
+    on_palm = first[palm > 0.999]
+    assert float(on_palm.max()) > 0.3 and -0.36 < float(on_palm.min()) < -0.3
+    assert not torch.equal(first, other) and torch.equal(first, relief(hand, 0))
+
+
+def test_blotches_of_blood_are_a_seeds_own_and_strongest_on_the_palm():
+    hand = bundled_hand()
+    palm = label_regions(hand).palm
+    first, other = (flush_shade(hand, seed)[:, 1] for seed in (0, 1))
+    assert not torch.equal(first, other)
+    assert 0.03 < float(first[palm > 0.999].std()) < 0.05
+    assert float(first.mean().abs()) < 0.005
+
+
+def test_a_smooth_back_says_little_of_its_palm(hand, palm_photo):
+    """The palm behind a smooth pale back was as smooth: .25 of real palms' contrast at 2 to 4 px."""
+    _, adapted = palm_photo
+    seen, palm = adapted.observations, label_regions(hand).palm
+    noise = 0.006 * torch.randn(1, len(palm), 1, generator=torch.Generator().manual_seed(0))
+    for side, of_seen in ((palm < 0.5, 1), (palm >= 0.5, 0)):
+        shown = seen._replace(colors=0.5 * noise.exp().expand(-1, -1, 3), confidence=side.float()[None])
+        gains = _clarities(hand, shown)
+        assert gains[of_seen] < gains[1 - of_seen] < 1
 
 
 def test_a_photo_with_crisp_skin_gets_crisper_skin_painted(hand, palm_photo):

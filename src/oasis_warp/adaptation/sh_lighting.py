@@ -6,8 +6,6 @@ shadows, gloss, wrinkles of the pose, and misplaced detail. So most of it become
 and other poses lose it. Only marks whose colours light cannot give to skin stay in the albedo as a whole.
 """
 
-from collections.abc import Sequence
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -323,38 +321,3 @@ def mark_probability(beyond: Float[Tensor, "V 3"]) -> Float[Tensor, "V 1"]:
         for measure, (low, high) in ((across, MARK_DISTANCES), (beyond.mean(-1), MARK_BRIGHTNESSES))
     ]
     return torch.maximum(*likely)[:, None]
-
-
-LIKELY_SHADE, LIKELY_HUE = (-0.6, 0.25), 0.1
-"""Range of the logarithm of shade on a slant, and of each channel's difference from the mean of all, which light gives
-to skin; set by eye, as the two below, on four of the photos in docs/looks.md."""
-SLANTED, OPENLY = 0.15, 0.4
-"""Cosines between normal and view up to which and from which skin is seen on a slant and openly."""
-
-
-def limit_shade(
-    hand: HandModel, gaussians: CanonicalGaussians, crops: Sequence[HandCrop], light: HandLight
-) -> CanonicalGaussians:
-    """Limit the shade to what light gives to skin, where all photos show that skin on a slant.
-
-    A pixel there also shows what lies beside the outline, such as the floor between fingers. In the photo's view this
-    is a rim of one pixel, but from the side it is a streak along a finger.
-
-    Args:
-        hand: Model of the surface.
-        gaussians: Adapted to the photos.
-        crops: The photos.
-        light: Light of the first.
-    """
-    if gaussians.shade is None:
-        return gaussians
-    facing = torch.stack([observe(hand, crop).facing for crop in crops]).amax(0)
-    slant = ((OPENLY - facing) / (OPENLY - SLANTED)).clamp(0, 1)
-    vertex_shade = torch.ones_like(crops[0].rest.vertices) if light.shade is None else light.shade
-    on_vertices = torch.cat([vertex_shade, slant[:, None]], 1)
-    own, share = vertex_to_gaussians(on_vertices, hand.faces.to(slant.device), gaussians).split([3, 1], 1)
-    total = (own * gaussians.shade).log()
-    grey = total.mean(-1, keepdim=True)
-    likely = grey.clamp(*LIKELY_SHADE) + (total - grey).clamp(-LIKELY_HUE, LIKELY_HUE)
-    limited = torch.lerp(total, likely, share).exp() / own
-    return gaussians._replace(shade=torch.where(share > 0, limited, gaussians.shade))

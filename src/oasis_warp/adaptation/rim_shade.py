@@ -1,0 +1,83 @@
+"""Shade at the rim of what photos show: kept to what light does to skin, and continued behind the hand."""
+
+from collections.abc import Sequence
+
+import torch
+
+from oasis_warp.adaptation.inpainting import inpaint
+from oasis_warp.adaptation.sh_lighting import MIN_CONFIDENCE
+from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
+from oasis_warp.avatar.observation import observe
+from oasis_warp.core import surface
+from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandLight
+
+LIKELY_SHADE, LIKELY_HUE = (-0.6, 0.25), 0.1
+"""Range of the logarithm of shade on a slant, and of each channel's difference from the mean of all, which light gives
+to skin; set by eye, as the two below, on four of the photos in docs/looks.md."""
+SLANTED, OPENLY = 0.15, 0.4
+"""Cosines between normal and view up to which and from which skin is seen on a slant and openly."""
+
+
+def limit_shade(
+    hand: HandModel, gaussians: CanonicalGaussians, crops: Sequence[HandCrop], light: HandLight
+) -> CanonicalGaussians:
+    """Limit the shade to what light gives to skin, where all photos show that skin on a slant.
+
+    A pixel there also shows what lies beside the outline, such as the floor between fingers. In the photo's view this
+    is a rim of one pixel, but from the side it is a streak along a finger.
+
+    Args:
+        hand: Model of the surface.
+        gaussians: Adapted to the photos.
+        crops: The photos.
+        light: Light of the first.
+    """
+    if gaussians.shade is None:
+        return gaussians
+    facing = torch.stack([observe(hand, crop).facing for crop in crops]).amax(0)
+    slant = ((OPENLY - facing) / (OPENLY - SLANTED)).clamp(0, 1)
+    vertex_shade = torch.ones_like(crops[0].rest.vertices) if light.shade is None else light.shade
+    on_vertices = torch.cat([vertex_shade, slant[:, None]], 1)
+    own, share = vertex_to_gaussians(on_vertices, hand.faces.to(slant.device), gaussians).split([3, 1], 1)
+    total = (own * gaussians.shade).log()
+    grey = total.mean(-1, keepdim=True)
+    likely = grey.clamp(*LIKELY_SHADE) + (total - grey).clamp(-LIKELY_HUE, LIKELY_HUE)
+    limited = torch.lerp(total, likely, share).exp() / own
+    return gaussians._replace(shade=torch.where(share > 0, limited, gaussians.shade))
+
+
+RIM_FACING, RIM_CONFIDENCE = 0.6, 0.2
+"""Cosine between normal and view below which skin is the rim of what a photo shows, and least confidence there."""
+RIM_DETAIL, BEHIND_REACH = 0.002, 0.04
+"""Length below which the rim's shade is averaged, and distance over which it is forgotten behind it [m]."""
+MAX_BEHIND = 0.5
+"""Largest logarithm of shade that is continued."""
+BEHIND_PASSES = 2
+"""Smoothings over the mesh of the border to what the photo shows."""
+
+
+def continue_shade(hand: HandModel, gaussians: CanonicalGaussians, crop: HandCrop, light: HandLight) -> HandLight:
+    """Continue dark shade from the rim of what the photo shows to the skin behind it.
+
+    Four harmonics miss how fast the light falls off to the side that a lamp does not reach. What they miss is shade,
+    which ended where the photo does: from the side it was a dark stripe before bright skin. The constants were set on
+    photos of tests/data/photos/same_hand.
+
+    Args:
+        hand: Model of the surface.
+        gaussians: Adapted to the photos.
+        crop: The first photo.
+        light: Its light.
+    """
+    if gaussians.shade is None or light.shade is None:
+        return light
+    rest, faces, seen = crop.rest.vertices, hand.faces.to(crop.image.device), observe(hand, crop)
+    own = vertex_colors(gaussians._replace(colors=gaussians.shade.log()), len(rest)) + light.shade.log()
+    grey = own.mean(-1, keepdim=True).clamp(-MAX_BEHIND, MAX_BEHIND)
+    rim = seen.confidence * ((seen.confidence > RIM_CONFIDENCE) & (seen.facing < RIM_FACING))
+    behind = inpaint(rest, faces, grey, rim, RIM_DETAIL, BEHIND_REACH)
+    hidden = (1 - seen.confidence / MIN_CONFIDENCE).clamp(0, 1)[:, None]
+    smooth = surface.smooth_over_mesh(hidden, surface.mesh_edges(faces), BEHIND_PASSES)
+    share = torch.minimum(smooth, hidden)
+    return light._replace(shade=torch.minimum(light.shade, torch.lerp(light.shade.log(), behind, share).exp()))
