@@ -23,7 +23,7 @@ from oasis_warp.hand.skinning import corrective_coefficients
 RIDGE = 1.0
 ELSEWHERE = 1e6
 """Ridge of a shape on a finger that is not its own nor beside it."""
-NAIL_BED, NAIL_FREE = 3.0, 8.0
+NAIL_BED, NAIL_FREE = 3.0, 9.0
 """Distances from a nail up to which skin keeps to the bone, and from which on it is free of it [mm]."""
 POSE_WEIGHT = 2.0
 """Of a state in which several joints are bent, against one joint bent alone."""

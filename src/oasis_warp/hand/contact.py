@@ -16,7 +16,7 @@ from oasis_warp.core.types import Side
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops.contact import GROUP, PARTS_OPPOSED, ContactTables, contact_shifts
 
-LIMIT = 0.004
+LIMIT = 0.006
 """Largest shift of a vertex [m]."""
 YIELD = 0.4
 """Share of the distance from a finger's bone to its skin that can yield: bones take .42 of it."""

@@ -22,11 +22,11 @@ OPPOSED, PARTS_OPPOSED = -0.3, 0.3
 """Cosines of the normals of skin that touches, and of its parts, at most: they differ by 35 degrees within a part."""
 ASIDE = 0.003
 """Distance along the surface to the nearest vertex of skin that touches, at most: edges have 2 mm [m]."""
-MARGIN = 0.0005
+MARGIN = 0.00075
 """How far skin is moved out [m]: edges between vertices that just touch would still cross."""
 FADES = 0.5
 """Share of the skin around a vertex that touches, below which its shift fades: that at the edge of a contact."""
-ROUNDS = 3
+ROUNDS = 4
 """Rounds of contact resolution; later ones make up for what the mean took from the first."""
 PAD = 0.003
 """Margin around a part's box [m]: normals of the flesh below differ from the part's own and lead that far aside."""

@@ -1,10 +1,10 @@
 // Fingers and palm of a posed hand give way to each other where they touch (the operator contact_shifts).
 "use strict";
 
-const DEEPEST = 0.005, ASIDE = 0.003, PUSH = 0.0005, PAD = 0.003; // metres
+const DEEPEST = 0.005, ASIDE = 0.003, PUSH = 0.00075, PAD = 0.003; // metres
 const OPPOSED = -0.3, PARTS_OPPOSED = 0.3; // cosines of normals
 const FADES = 0.5; // share of the skin around a vertex that touches, below which its shift fades
-const ROUNDS = 3;
+const ROUNDS = 4;
 const FREE = Math.PI / 18; // change of an angle from the photo's pose
 const BOX = 15; // numbers a part: corners of its skin, corners of its skin with the flesh under it, normal
 
