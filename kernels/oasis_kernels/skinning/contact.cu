@@ -1,6 +1,6 @@
 // Contact on CUDA, the rules of `contact.py`, by warps: one for each part or vertex of each image.
 //
-// `boxes` (parts, then a thread per vertex for normals) -> `meetings` (parts; a lane for each part of a group) -> three
+// `boxes` (parts, then a thread per vertex for normals) -> `meetings` (parts; a lane for each part of a group) ->
 // rounds of `contacts` and `spread` (vertices; a lane for each part, vertex of a part, or neighbour). Of two vertices
 // equally near, the one that stands first is taken, as on the CPU.
 
