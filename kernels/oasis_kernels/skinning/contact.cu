@@ -59,8 +59,7 @@ __global__ void boxes(
     put(1, high, 0.f);
     put(2, {low.x + fminf(under.x, 0.f) - pad, low.y + fminf(under.y, 0.f) - pad, low.z + fminf(under.z, 0.f) - pad},
         0.f);
-    put(3,
-        {high.x + fmaxf(under.x, 0.f) + pad, high.y + fmaxf(under.y, 0.f) + pad, high.z + fmaxf(under.z, 0.f) + pad},
+    put(3, {high.x + fmaxf(under.x, 0.f) + pad, high.y + fmaxf(under.y, 0.f) + pad, high.z + fmaxf(under.z, 0.f) + pad},
         0.f);
     put(4, facing, 0.f);
     state[row] = 0;
@@ -145,9 +144,11 @@ __global__ void contacts(
             if (bits >> lane & 1) {
                 const int p = 32 * g + lane;
                 const V4 low = get4(boxes, 5 * b * n_parts + p), high = get4(boxes, (5 * b + 1) * n_parts + p);
-                const V3 past = {fmaxf(fmaxf(low.w - here.x, here.x - high.w), 0.f),
-                                 fmaxf(fmaxf(low.x - here.y, here.y - high.x), 0.f),
-                                 fmaxf(fmaxf(low.y - here.z, here.z - high.y), 0.f)};
+                const V3 past = {
+                    fmaxf(fmaxf(low.w - here.x, here.x - high.w), 0.f),
+                    fmaxf(fmaxf(low.x - here.y, here.y - high.x), 0.f),
+                    fmaxf(fmaxf(low.y - here.z, here.z - high.y), 0.f)
+                };
                 near = dot3(past, past) < squared_of(best);
             }
             unsigned left = __ballot_sync(0xffffffffu, near);

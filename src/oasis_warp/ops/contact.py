@@ -11,8 +11,14 @@ from oasis_kernels.skinning import contact_cuda
 from oasis_warp.ops._runtime.declaration import Array, Declaration
 from oasis_warp.ops._runtime.incidence import Incidence, incidence
 from oasis_warp.ops._runtime.launch import (
-    aligned, block_count, current_stream, even_cuts, launch_ranges, run_cuda, vectors,
-)  # fmt: skip
+    aligned,
+    block_count,
+    current_stream,
+    even_cuts,
+    launch_ranges,
+    run_cuda,
+    vectors,
+)
 
 GROUP = 32
 """Parts of a group: bits of a word."""
@@ -156,13 +162,13 @@ def _shifts_on_cuda(
     def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
         return vertices.new_empty((batch, *shape), dtype=dtype)
 
-    one_block = contact_cuda.WARPS
-    box_blocks, rows = block_count(batch * n_parts, one_block), block_count(batch * n, one_block)
+    box_blocks, rows = (block_count(batch * items, contact_cuda.WARPS) for items in (n_parts, n))
     params = t._asdict() | {
         "batch": batch, "n": n, "n_parts": n_parts, "n_groups": n_groups, "reach": DEEPEST, "points": vertices,
         "boxes": empty(5, n_parts, 4), "normals": empty(n, 3), "met": empty(n_parts, n_groups, dtype=torch.int32),
         "state": empty(n_parts, dtype=torch.int32), "others": empty(n, dtype=torch.int32), "wanted": empty(n, 4),
-        "aside": ASIDE, "margin": MARGIN, "fades": FADES, "whole": whole, "shifts": None,
+        "aside": ASIDE, "margin": MARGIN, "fades": FADES, "whole": whole, "shifts": None, "changes": None,
+        "n_changes": 0,
     }  # fmt: skip
     stream = current_stream(vertices.device)
     surface = {
@@ -176,8 +182,8 @@ def _shifts_on_cuda(
     params["opposed"] = OPPOSED
     for k in range(ROUNDS):
         run_cuda(contact_cuda.contacts, params, rows, stream)
-        last = changes is not None and k == ROUNDS - 1
-        params |= {"changes": changes if last else None, "n_changes": changes.shape[1] if last else 0}
+        if changes is not None and k == ROUNDS - 1:
+            params |= {"changes": changes, "n_changes": changes.shape[1]}
         params["out"] = empty(n, 3)
         run_cuda(contact_cuda.spread, params, rows, stream)
         params["shifts"] = params["out"]
