@@ -77,6 +77,13 @@ def test_a_hand_that_moves_as_a_whole_gives_way_alike(hand, fist, led_out, devic
     assert float((off > 1e-5).float().mean()) < 0.003  # of two vertices equally near it may take the other
 
 
+def test_near_the_photos_pose_skin_gives_way_in_part(hand, fist, led_out, device):
+    changes = torch.tensor([0.01, math.radians(-5), 0.0], device=device)
+    made = resolve_contact(hand.to(device), fist.to(device), changes=changes).cpu()
+    off = (made - torch.lerp(fist, led_out, 0.5)).norm(dim=1)
+    assert float((off > 1e-5).float().mean()) < 0.003
+
+
 def test_many_poses_and_threads_give_the_same_bits(hand, fist, led_out):
     with using_threads(3):
         both = resolve_contact(hand, torch.stack([posed(hand, "open", 103), fist]))
