@@ -108,7 +108,7 @@ def contact_shifts(
         for k in range(0, len(vertices), MAX_SURFACES):
             some, by = aligned(*(None if t is None else t[k : k + MAX_SURFACES] for t in (vertices, changes)))
             parts.append(_shifts_on_cuda(some, index, tables, outward, by, whole))
-        return torch.cat(parts) if len(parts) != 1 else parts[0]
+        return parts[0] if len(parts) == 1 else torch.cat([vertices[:0], *parts])  # there may be none
     shifts = _shifts_on_cpu(vertices.contiguous(), index, tables, outward)
     if shifts is None or changes is None:
         return shifts
