@@ -7,7 +7,7 @@
 __global__ void boxes(
 #include "contact_parameters.inc"
     int box_blocks,
-    const int* offsets,  // [V + 1]; corners of vertex v are corners_of[offsets[v] .. offsets[v + 1] - 1]
+    const int* offsets,  // [V + 1]; corners of vertex v are entries[offsets[v] .. offsets[v + 1] - 1]
     const int* entries,  // [3 F]; 3 face + corner
     const int* faces,    // [F, 3]
     const int* samples,  // [P, E]

@@ -1,5 +1,6 @@
 """Contact: a posed surface gives way where it lies inside another part of itself."""
 
+import functools
 from typing import NamedTuple
 
 import torch
@@ -115,14 +116,17 @@ def contact_shifts(
     return (changes.abs().amax(1) / whole).clamp(max=1)[:, None, None] * shifts
 
 
+def _empty(vertices: Float[Tensor, "B V 3"], *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Memory of this shape for each surface."""
+    return vertices.new_empty((len(vertices), *shape), dtype=dtype)
+
+
 def _shifts_on_cpu(
     vertices: Float[Tensor, "B V 3"], index: Incidence, t: ContactTables, outward: float
 ) -> Float[Tensor, "B V 3"] | None:
     batch, n, n_parts, n_groups = *vertices.shape[:2], *t.allowed.shape
 
-    def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-        return vertices.new_empty((batch, *shape), dtype=dtype)
-
+    empty = functools.partial(_empty, vertices)
     points = vectors(vertices, 2)
     corners, groups = vectors(empty(n_parts, 5, 3), 3), vectors(empty(n_groups, 2, 3), 3)
     met, state = empty(n_parts, n_groups, dtype=torch.int32), empty(n_parts, dtype=torch.int32)
@@ -159,9 +163,7 @@ def _shifts_on_cuda(
 ) -> Float[Tensor, "B V 3"]:  # fmt: skip
     batch, n, n_parts, n_groups = *vertices.shape[:2], *t.allowed.shape
 
-    def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-        return vertices.new_empty((batch, *shape), dtype=dtype)
-
+    empty = functools.partial(_empty, vertices)
     box_blocks, rows = (block_count(batch * items, contact_cuda.WARPS) for items in (n_parts, n))
     params = t._asdict() | {
         "batch": batch, "n": n, "n_parts": n_parts, "n_groups": n_groups, "reach": DEEPEST, "points": vertices,
