@@ -1,8 +1,8 @@
-// Contact on CUDA, the rules of `contact.py`, by warps: one for each part or vertex of each image.
+// Contact on CUDA, the rules of `contact.py`, by warps and parts of them, for each part or vertex of each image.
 //
 // `boxes` (parts, then a thread per vertex for normals) -> `meetings` (parts; a lane for each part of a group) ->
-// rounds of `contacts` and `spread` (vertices; a lane for each part, vertex of a part, or neighbour). Of two vertices
-// equally near, the one that stands first is taken, as on the CPU.
+// `find` (vertices; a lane for each part or vertex of a part) -> rounds of `contacts` and `spread` (vertices; `LANES`
+// lanes for the neighbours). Of two vertices equally near, the one that stands first is taken, as on the CPU.
 
 __global__ void boxes(
 #include "contact_parameters.inc"
@@ -107,34 +107,21 @@ __global__ void meetings(
         }
 }
 
-__global__ void contacts(
+__global__ void find(
 #include "contact_parameters.inc"
-#include "contact_neighbours.inc"
-    const float* shifts,  // [B, V, 3]; 0 in the first round, which finds the nearest skin
-    float opposed,
-    float aside,
-    float margin
+    float opposed
 ) {
 #include "../posing/vectors_cuda.h"
-    typedef unsigned long long Key;  // squared distance, then place in the row
+#include "contact_keys.h"
     const long long row = (long long)block_index * WARPS + (threadIdx.x >> 5);
     const int lane = threadIdx.x & 31;
     if (row >= (long long)batch * n) return;
     const long long b = row / n;
     const int v = (int)(row - b * n), own = part[v];
-    const float *x = points + 3 * b * n, *facing = normals + 3 * b * n;
-    auto nearest_of = [](Key key) -> Key {
-        for (int step = 16; step > 0; step >>= 1) key = min(key, __shfl_xor_sync(0xffffffffu, key, step));
-        return key;
-    };
-    auto key_of = [](float squared, int place) -> Key { return (Key)__float_as_uint(squared) << 32 | (unsigned)place; };
-    auto squared_of = [](Key key) -> float { return __uint_as_float((unsigned)(key >> 32)); };
-    int last = -1;
-    const V3 normal = get3(facing, v);
-    if (shifts) {
-        last = others[row];
-    } else if (state[b * n_parts + own] == 2) {
-        const V3 here = get3(x, v);
+    int found = -1;
+    if (state[b * n_parts + own] == 2) {
+        const float *x = points + 3 * b * n, *facing = normals + 3 * b * n;
+        const V3 here = get3(x, v), normal = get3(facing, v);
         const Key none = key_of(reach * reach, -1);
         Key best = none;
         for (int g = 0; g < n_groups; g++) {
@@ -163,28 +150,47 @@ __global__ void contacts(
                         best = key_of(distance, e);
                 }
             }
-            best = nearest_of(best);
+            best = nearest_of(best, 0xffffffffu, 32);
         }
-        if (best < none) last = members[(int)(unsigned)best];
+        if (best < none) found = members[(int)(unsigned)best];
     }
-    if (!shifts && lane == 0) others[row] = last;
+    if (lane == 0) others[row] = found;
+}
+
+__global__ void contacts(
+#include "contact_parameters.inc"
+#include "contact_neighbours.inc"
+    const float* shifts,  // [B, V, 3]; 0 in the first round
+    float opposed,
+    float aside,
+    float margin
+) {
+#include "../posing/vectors_cuda.h"
+#include "contact_keys.h"
+    const long long row = (long long)block_index * (BLOCK / LANES) + threadIdx.x / LANES;
+    const int lane = threadIdx.x % LANES;
+    if (row >= (long long)batch * n) return;
+    const long long b = row / n;
+    const int v = (int)(row - b * n), last = others[row];
     V4 wish = {0.f, 0.f, 0.f, 0.f};
     if (last >= 0) {
+        const unsigned together = ((1u << LANES) - 1) << (threadIdx.x & (32 - LANES));
+        const float *x = points + 3 * b * n, *facing = normals + 3 * b * n;
         auto place = [&](int j) -> V3 {
             const V3 y = get3(x, j);
             return shifts ? plus(y, get3(shifts + 3 * b * n, j)) : y;
         };
-        const V3 here = place(v), first = minus(place(last), here);
+        const V3 here = place(v), normal = get3(facing, v), first = minus(place(last), here);
         Key best = key_of(dot3(first, first), 0);
         const int start = offsets[last];
-        for (int e = start + lane; e < offsets[last + 1]; e += 32) {
+        for (int e = start + lane; e < offsets[last + 1]; e += LANES) {
             const int j = neighbours[e];
             const V3 r = minus(place(j), here);
             const float distance = dot3(r, r);
             if (distance < squared_of(best) && dot3(normal, get3(facing, j)) < opposed)
                 best = key_of(distance, e - start + 1);
         }
-        best = nearest_of(best);
+        best = nearest_of(best, together, LANES);
         const int at = (int)(unsigned)best, other = at ? neighbours[start + at - 1] : last;
         const V3 m = get3(facing, other), r = minus(place(other), here);
         const float depth = dot3(r, m), both = give[v] + give[other];
@@ -208,21 +214,22 @@ __global__ void spread(
     float* out  // [B, V, 3]
 ) {
 #include "../posing/vectors_cuda.h"
-    const long long row = (long long)block_index * WARPS + (threadIdx.x >> 5);
-    const int lane = threadIdx.x & 31;
+    const long long row = (long long)block_index * (BLOCK / LANES) + threadIdx.x / LANES;
+    const int lane = threadIdx.x % LANES;
     if (row >= (long long)batch * n) return;
     const long long b = row / n;
     const int v = (int)(row - b * n);
     V3 moved = {0.f, 0.f, 0.f};
     if (state[b * n_parts + part[v]] > 0) {
+        const unsigned together = ((1u << LANES) - 1) << (threadIdx.x & (32 - LANES));
         V4 total = {0.f, 0.f, 0.f, 0.f};
-        for (int e = offsets[v] + lane; e < offsets[v + 1]; e += 32)
+        for (int e = offsets[v] + lane; e < offsets[v + 1]; e += LANES)
             total = plus4(total, scaled4(weights[e], get4(wanted, b * n + neighbours[e])));
         float most = 0.f;
         if (changes)
-            for (int k = lane; k < n_changes; k += 32) most = fmaxf(most, fabsf(changes[b * n_changes + k]));
-        for (int step = 16; step > 0; step >>= 1) {
-            auto other = [&](float y) -> float { return __shfl_xor_sync(0xffffffffu, y, step); };
+            for (int k = lane; k < n_changes; k += LANES) most = fmaxf(most, fabsf(changes[b * n_changes + k]));
+        for (int step = LANES / 2; step > 0; step >>= 1) {
+            auto other = [&](float y) -> float { return __shfl_xor_sync(together, y, step); };
             total = plus4(total, {other(total.w), other(total.x), other(total.y), other(total.z)});
             most = fmaxf(most, other(most));
         }

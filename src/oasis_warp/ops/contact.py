@@ -164,7 +164,8 @@ def _shifts_on_cuda(
     batch, n, n_parts, n_groups = *vertices.shape[:2], *t.allowed.shape
 
     empty = functools.partial(_empty, vertices)
-    box_blocks, rows = (block_count(batch * items, contact_cuda.WARPS) for items in (n_parts, n))
+    box_blocks, find_blocks = (block_count(batch * items, contact_cuda.WARPS) for items in (n_parts, n))
+    rows = block_count(batch * n, contact_cuda.BLOCK // contact_cuda.LANES)
     params = t._asdict() | {
         "batch": batch, "n": n, "n_parts": n_parts, "n_groups": n_groups, "reach": DEEPEST, "points": vertices,
         "boxes": empty(5, n_parts, 4), "normals": empty(n, 3), "met": empty(n_parts, n_groups, dtype=torch.int32),
@@ -182,6 +183,7 @@ def _shifts_on_cuda(
     near = {"n_beside": t.beside.shape[1], "opposed": PARTS_OPPOSED}
     run_cuda(contact_cuda.meetings, params | near, box_blocks, stream)
     params["opposed"] = OPPOSED
+    run_cuda(contact_cuda.find, params, find_blocks, stream)
     for k in range(ROUNDS):
         run_cuda(contact_cuda.contacts, params, rows, stream)
         if changes is not None and k == ROUNDS - 1:
