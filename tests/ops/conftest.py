@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from oasis_warp.ops._runtime import picture_extension, picture_node
-from oasis_warp.ops._runtime.launch import start
 from oasis_warp.ops._runtime.plans import Plans
 
 
@@ -30,7 +29,6 @@ def with_threads():
 @pytest.fixture
 def extension(request, monkeypatch):
     """The node, built once for all runs of the tests: nobody else shall find and use it."""
-    start()  # before its folder: Warp, which looks into it when it begins, takes the node for an old kernel
     monkeypatch.setenv("OASIS_WARP_CACHE", str(request.config.cache.mkdir("extension")))
     monkeypatch.delenv(picture_extension.VARIABLE, raising=False)
     picture_extension._load.cache_clear()

@@ -110,15 +110,18 @@ def test_flipped_bits_in_a_real_cache_are_found_and_built_anew(tmp_path):
 def test_what_a_killed_build_has_left_is_removed_after_an_hour(tmp_path, monkeypatch):
     monkeypatch.setenv("OASIS_WARP_CACHE", str(tmp_path))
     gone = 1 << 23  # more than Linux counts
+    kernels = tmp_path / wp.config.version  # where Warp keeps them
     names = (f"wp_a_1_p{gone}_t34", f"wp_b_2_p{gone}_t34", "wp_c_3", f"wp_d_4_p{os.getpid()}_t34")
-    old, young, whole, building = (tmp_path / name for name in names)
-    for folder in (old, young, whole, building):
-        folder.mkdir()
+    old, young, whole, building = (kernels / name for name in names)
+    node = tmp_path / f"extension_e_p{gone}_tx7"
+    for folder in (old, young, whole, building, node):
+        folder.mkdir(parents=True)
         (folder / "a.o").write_bytes(b"half")
-    for folder in (old, whole, building):
+    for folder in (old, whole, building, node):
         os.utime(folder, (0, 0))  # the clock has jumped ahead, for the build that goes on
     assert writable_cache() == tmp_path
-    assert sorted(path.name for path in tmp_path.iterdir()) == [young.name, whole.name, building.name]
+    assert sorted(path.name for path in kernels.iterdir()) == [young.name, whole.name, building.name]
+    assert not node.exists()
 
 
 POISON = float("nan"), float("inf"), -float("inf"), 1.1e15, -1e30

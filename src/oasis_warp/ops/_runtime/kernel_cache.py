@@ -41,9 +41,10 @@ def writable_cache() -> Path:
 def remove_abandoned(cache: Path) -> None:
     """Remove what builds have left that were killed: folders named after a process and a thread, an hour old.
 
-    A clock that jumps ahead makes them all old: those of processes that live stay.
+    Warp's kernels are in a folder for each version of it. A clock that jumps ahead makes all folders old: those of
+    processes that live stay.
     """
-    for folder in cache.glob("wp_*_p*_t*"):
+    for folder in (*cache.glob("*_p*_t*"), *cache.glob("*/wp_*_p*_t*")):
         process = folder.name.rpartition("_t")[0].rpartition("_p")[2]
         try:
             if time.time() - folder.stat().st_mtime > ABANDONED and not Path("/proc", process).is_dir():

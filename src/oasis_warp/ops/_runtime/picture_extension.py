@@ -60,9 +60,10 @@ def build() -> Path:
 
         target.parent.mkdir(parents=True, exist_ok=True)
         remove_abandoned(target.parent)
-        # Named as kernels under construction are, so that one that is killed is removed later. A process of its own
-        # builds in a folder of its own: torch's lock would outlive a killed build.
-        prefix = f"wp_{target.name}_p{os.getpid()}_t"
+        # Named after process and thread, as kernels under construction are, so that one that is killed is removed
+        # later; not wp_..., which Warp takes for a kernel of an earlier version. A process of its own builds in a
+        # folder of its own: torch's lock would outlive a killed build.
+        prefix = f"{target.name}_p{os.getpid()}_t"
         with tempfile.TemporaryDirectory(prefix=prefix, dir=target.parent) as place:
             # Loaded as a library only, because Python would bind its types to this path.
             cpp_extension.load(
