@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.adaptation.adapt import Adaptation, adapt, add_detail
-from oasis_warp.adaptation.rim_shade import continue_shade, limit_shade
+from oasis_warp.adaptation.rim_shade import continue_shade, limit_shade, match_rim
 from oasis_warp.adaptation.unseen_skin import paint_unseen
 from oasis_warp.avatar.densify import coarsen
 from oasis_warp.avatar.observation import inner_mask
@@ -295,7 +295,8 @@ def _finish(
     rest, lights = first.rest.vertices, adaptation.lights
     if lights is not None:
         gaussians = limit_shade(hand, gaussians, crops, lights[0])
-        lights = (continue_shade(hand, gaussians, first, lights[0]), *lights[1:])
+        behind = continue_shade(hand, gaussians, first, lights[0])
+        lights = (match_rim(hand, gaussians, first, behind), *lights[1:])
         lights = tuple(end_shade(hand, light, rest) for light in lights)
     return adaptation._replace(gaussians=close_wrist(hand, gaussians, rest), lights=lights), invented
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 from synthetic import crop_of
 
-from oasis_warp.adaptation.rim_shade import continue_shade, limit_shade
+from oasis_warp.adaptation.rim_shade import continue_shade, limit_shade, match_rim
 from oasis_warp.avatar.anchors import vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.observation import observe
@@ -49,3 +49,26 @@ def test_dark_shade_goes_on_behind_the_rim_and_bright_shade_does_not(hand, scene
 def test_without_shade_there_is_none_to_continue(hand, scene):
     crop, truth, light = scene
     assert continue_shade(hand, truth._replace(shade=None), crop, light) is light
+
+
+def test_skin_just_behind_the_rim_is_drawn_in_the_colours_of_the_rim(hand, scene):
+    """Its Gaussians show past outlines: in another tone they were thin lines along fingers in front of fingers."""
+    crop, truth, light = scene
+    seen = observe(hand, crop)
+    known, hidden = seen.confidence > 0.1, seen.confidence <= 0
+    tone = torch.where(known[:, None], 0.0, torch.tensor([-0.2, -0.25, -0.3])).exp()
+    gaussians = truth._replace(
+        colors=truth.colors * vertex_to_gaussians(tone, hand.faces, truth), shade=torch.ones_like(truth.colors)
+    )
+    shade = match_rim(hand, gaussians, crop, light._replace(shade=torch.ones_like(tone))).shade
+    assert shade is not None
+    distance = torch.cdist(crop.rest.vertices[hidden], crop.rest.vertices[known]).amin(1)
+    difference = (tone * shade)[hidden].log()
+    assert bool((shade[known] == 1).all())
+    assert float(difference[distance < 0.001].abs().mean()) < 0.12 < 0.2 < float(-difference[distance > 0.02].mean())
+    assert float(shade.log().abs().max()) < 0.7 and float(shade.log().std(1).max()) < 0.11
+
+
+def test_without_shade_the_rim_stays_as_it_is(hand, scene):
+    crop, truth, light = scene
+    assert match_rim(hand, truth._replace(shade=None), crop, light) is light

@@ -1,13 +1,16 @@
-"""Shade at the rim of what photos show: kept to what light does to skin, and continued behind the hand."""
+"""Shade at the rim of what photos show: kept to what light does to skin, and continued behind the rim."""
 
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.adaptation.sh_lighting import MIN_CONFIDENCE
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.observation import observe
+from oasis_warp.avatar.pose import MIN_COLOR, posed_lighting, shading
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandLight
@@ -41,10 +44,14 @@ def limit_shade(
     on_vertices = torch.cat([vertex_shade, slant[:, None]], 1)
     own, share = vertex_to_gaussians(on_vertices, hand.faces.to(slant.device), gaussians).split([3, 1], 1)
     total = (own * gaussians.shade).log()
-    grey = total.mean(-1, keepdim=True)
-    likely = grey.clamp(*LIKELY_SHADE) + (total - grey).clamp(-LIKELY_HUE, LIKELY_HUE)
-    limited = torch.lerp(total, likely, share).exp() / own
+    limited = torch.lerp(total, _likely(total, *LIKELY_SHADE), share).exp() / own
     return gaussians._replace(shade=torch.where(share > 0, limited, gaussians.shade))
+
+
+def _likely(log_shade: Float[Tensor, "N 3"], least: float, most: float) -> Float[Tensor, "N 3"]:
+    """The nearest shade that light can give to skin."""
+    grey = log_shade.mean(-1, keepdim=True)
+    return grey.clamp(least, most) + (log_shade - grey).clamp(-LIKELY_HUE, LIKELY_HUE)
 
 
 RIM_FACING, RIM_CONFIDENCE = 0.6, 0.2
@@ -81,3 +88,39 @@ def continue_shade(hand: HandModel, gaussians: CanonicalGaussians, crop: HandCro
     smooth = surface.smooth_over_mesh(hidden, surface.mesh_edges(faces), BEHIND_PASSES)
     share = torch.minimum(smooth, hidden)
     return light._replace(shade=torch.minimum(light.shade, torch.lerp(light.shade.log(), behind, share).exp()))
+
+
+EDGE_DETAIL, JUST_BEHIND = 0.0005, 0.003
+"""Length below which the rim's colours are averaged, and distance over which skin behind it gets as different from it
+as its own colour and light make it [m]: Gaussians of 1 mm show that far past what hides them."""
+MIN_PROXIMITY = 1e-3
+"""Share of the rim in a mean over the skin around, below which that mean tells nothing."""
+
+
+def match_rim(hand: HandModel, gaussians: CanonicalGaussians, crop: HandCrop, light: HandLight) -> HandLight:
+    """Draw skin just behind the rim in the colours of the rim.
+
+    Gaussians there show past every outline, those inside the hand too. In their own colour and light they were thin
+    lines along fingers in front of fingers.
+
+    Args:
+        hand: Model of the surface.
+        gaussians: Adapted to the photos.
+        crop: The first photo.
+        light: Its light.
+    """
+    if gaussians.shade is None or light.shade is None:
+        return light
+    rest, faces, seen = crop.rest.vertices, hand.faces.to(crop.image.device), observe(hand, crop)
+    lit = shading(light, posed_lighting(rest, crop.posed.vertices, faces, light))
+    unshaded, own = (
+        vertex_colors(gaussians._replace(colors=colors.clamp_min(MIN_COLOR).log()), len(rest))
+        for colors in (gaussians.colors, gaussians.shade)
+    )
+    unshaded = unshaded + lit.clamp_min(MIN_COLOR).log()
+    known = seen.confidence * (seen.confidence > MIN_CONFIDENCE)
+    drawn = torch.cat([unshaded + own + light.shade.log(), torch.ones_like(known)[:, None]], 1)
+    around, near = inpaint(rest, faces, drawn, known, EDGE_DETAIL, JUST_BEHIND).split([3, 1], 1)
+    wanted = _likely(around / near.clamp_min(MIN_PROXIMITY) - unshaded - own, -MAX_BEHIND, MAX_BEHIND)
+    share = (1 - seen.confidence / MIN_CONFIDENCE).clamp(0, 1)[:, None] * near.clamp(0, 1)
+    return light._replace(shade=torch.lerp(light.shade.log(), wanted, share).exp())
