@@ -39,8 +39,9 @@ AVERAGED = 32
 """Number of nearest Gaussians of that skin, 3 to 6 mm around; detail is the difference of one from their mean."""
 DARKEST = 0.02
 """Colours are clamped to it before their logarithm is taken [sRGB]."""
-LOUDEST = 0.06
-"""Largest logarithm of that detail, three times the finest contrast of real backs: more is a shadow or a sleeve."""
+CONTRAST = 0.02
+"""Largest standard deviation of that detail's logarithm, the finest contrast of real backs: more is the edge of a shadow
+or of a sleeve."""
 RIM_PARTS = -1 / 3, 0.0, 1 / 3
 """Places of Gaussians along the edges at a vertex of the rim, as shares of the edge: one on each vertex makes teeth."""
 RIM_SPREAD = 0.8
@@ -140,8 +141,11 @@ def _continued(
     keys = torch.cat([aside, past[:, None]], 1), torch.cat([skin_aside, before[:, None]], 1)
     source = _nearest(*keys, 1)[:, 0]
     logs, places = gaussians.colors[skin].clamp_min(DARKEST).log(), centers[skin]
-    detail = logs[source] - logs[_nearest(places[source], places, AVERAGED)].mean(1)
-    detail = detail.clamp(-LOUDEST, LOUDEST) * (2 * out / radius).clamp(max=1)[:, None]
+    around = logs[_nearest(places[source], places, AVERAGED)]
+    average = around.mean(1)
+    contrast = (around - average[:, None]).square().mean((1, 2)).sqrt()
+    weight = (CONTRAST / contrast.clamp_min(CONTRAST)) * (2 * out / radius).clamp(max=1)
+    detail = (logs[source] - average).clamp(-3 * CONTRAST, 3 * CONTRAST) * weight[:, None]
     return (mean * detail.exp()).clamp(max=1)
 
 
