@@ -147,9 +147,9 @@ has a contrast of 5.1 / 7.5 % at 2-4 / 4-8 px, its painted back 3.7 / 5.1 with t
 four thirds, which looks bony: set between these by eye."""
 PALM_PER_MM = (0.14, 0.22, 0.24)
 """The same on palms: light that reached a hollow through the skin is red."""
-WIDE, WIDE_PASSES = 0.85, 6
-"""How much more the wide part of a back's relief adds, and the smoothings over the mesh that leave it, 5 mm. With none
-hidden backs have .51 of real hands' contrast at 4-8 px, with this .59 (16 photos of same_hand); 1.4 times as much of
+WIDE, WIDE_PASSES = 1.3, 6
+"""How much more the wide part of a back's relief adds, and the smoothings over the mesh that leave it, 5 mm. With .85
+hidden backs have .56 of real hands' contrast at 4-8 px, with this .60 (17 photos of same_hand); 1.4 times as much of
 all relief gives as much and looks bony."""
 MOST, DEEPEST_ON_PALM = 0.7, 0.35
 """Heights above and below the skin around to which forms are clamped, and the depth on palms, whose creases are lines

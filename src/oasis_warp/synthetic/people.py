@@ -42,6 +42,8 @@ FORMAT = "oasis-person"
 _UP, _PAD, _BACK_OF_KNUCKLE = np.array([0.0, 8, 0]), np.array([-5.0, -12, 0]), np.array([1.5, 0, 0])
 _ACROSS = (1, 4, 10, 7)
 """First joints of index, middle, ring and little finger, in anatomical order."""
+_TENDONS = (0.75, 1.0, 0.85, 0.6)
+"""How far their tendons stand out, relative to the middle finger's; all fade towards the wrist."""
 
 
 class Person(NamedTuple):
@@ -254,7 +256,7 @@ def relief_forms() -> np.ndarray:
         bony += back * 1.7 * blob(knuckle + up * 9 + _BACK_OF_KNUCKLE, 8.5)
         s = np.clip((points - knuckle) @ -knuckle / (knuckle @ knuckle), 0, 1)
         off = np.linalg.norm((points - knuckle * (1 - s)[:, None])[:, [0, 2]], axis=1)
-        tendon = back * _step(1.0, 0.75, s) * 1.2 * np.exp(-((off / 2.6) ** 2))
+        tendon = _TENDONS[i] * back * _step(1.0, 0.25, s) * 1.2 * np.exp(-((off / 2.6) ** 2))
         tendons += 0.3 * tendon
         both += 0.9 * tendon
         if i < 3:
