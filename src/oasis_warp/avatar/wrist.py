@@ -40,8 +40,8 @@ AVERAGED = 32
 DARKEST = 0.02
 """Colours are clamped to it before their logarithm is taken [sRGB]."""
 CONTRAST = 0.02
-"""Largest standard deviation of that detail's logarithm, the finest contrast of real backs: more is the edge of a shadow
-or of a sleeve."""
+"""Largest standard deviation of that detail's logarithm, the finest contrast of real backs: more is the edge of a
+shadow or of a sleeve."""
 RIM_PARTS = -1 / 3, 0.0, 1 / 3
 """Places of Gaussians along the edges at a vertex of the rim, as shares of the edge: one on each vertex makes teeth."""
 RIM_SPREAD = 0.8
