@@ -199,6 +199,16 @@ def test_the_end_is_opaque_and_has_the_colour_of_the_skin_before_it(hand, hands)
     assert apart.median() < 1e-3 and apart.max() < 0.06  # the detail of the edge to the palm comes along
 
 
+def test_the_detail_of_the_end_is_no_louder_than_skin(hand, hands):
+    """Beside the edge of a sleeve each value was clamped by itself, which left .05: a mottled patch."""
+    rest, before, _ = hands
+    noise = 0.3 * torch.randn(len(before.colors), 1, generator=torch.Generator().manual_seed(0))
+    after = close_wrist(hand, before._replace(colors=(before.colors * noise.exp()).clamp(max=1)), rest)
+    on_end = (torch.cdist(centers(hand, rest, after), rest[hand.rim]).amin(1) < 0.3 * RIM_FADE).nonzero()[:, 0]
+    logs = after.colors[on_end[on_end >= len(after.vertex_index)]].log()
+    assert 0.01 < (logs - logs.mean(0)).std() < 0.03
+
+
 def test_the_hand_beyond_the_fade_keeps_its_bits_and_the_cap_goes_with_the_wrist(hand, hands):
     rest, before, after = hands
     cap = torch.zeros(len(after.opacities), dtype=torch.bool)
