@@ -12,7 +12,15 @@ from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.adaptation.inpainting import FADE_LENGTH, inpaint, laplacian_and_mass
 from oasis_warp.adaptation.reliability import mask_unreliable
 from oasis_warp.adaptation.skin_detail import Places, flush_shade, relief, sample_detail
-from oasis_warp.adaptation.unseen_skin import MORE, SEEN, _clarities, infer_tone, paint_unseen, tone_colors
+from oasis_warp.adaptation.unseen_skin import (
+    MORE,
+    SEEN,
+    _clarities,
+    _skin_detail,
+    infer_tone,
+    paint_unseen,
+    tone_colors,
+)
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.densify import coarsen
@@ -117,7 +125,7 @@ def test_a_photo_with_crisp_skin_gets_crisper_skin_painted(hand, palm_photo):
         made = paint(hand, palm_photo, observations=seen._replace(colors=seen.colors * (contrast * noise).exp()))
         where = unseen_back(hand, made)
         found.append(float(detail_of(hand, vertex_colors(made.gaussians, len(where)), where)))
-    assert found[1] > 1.5 * found[0]
+    assert found[1] > 1.35 * found[0]  # blotches and relief are the same
 
 
 def test_the_photo_looks_as_before_in_its_own_view(hand, palm_photo, painted):
@@ -365,3 +373,16 @@ def test_the_palm_beside_a_finger_that_lies_on_it_is_unreliable(hand, monkeypatc
             patch.setattr(reliability, "FINGER_GAP", torch.inf)
             shares[name] = float((mask_unreliable(hand, crop.image, crop).mask - sure).sum() / crop.mask.sum())
     assert shares["fist"] > 0.02 and shares["open"] < 0.01
+
+
+def test_no_finger_has_dark_bars_on_its_palm_side():
+    """One of the maps' hands has dark skin, in whose creases pigment lies: to .75 of the skin around, on one finger."""
+    hand = bundled_hand()
+    palm = label_regions(hand).palm[hand.faces].mean(1)
+    faces, middle = torch.arange(len(hand.faces)), torch.full(hand.faces.shape, 1 / 3)
+    bones = hand.segment[hand.faces[:, 0]]
+    for seed in range(3):
+        detail = sample_detail(hand, Places(faces[:0], faces, middle), seed)
+        added = _skin_detail(detail, palm[:, None]).mean(1)
+        darkest = [float(added[(bones == bone) & (palm > 0.7)].quantile(0.05)) for bone in range(1, 16)]
+        assert -0.2 < min(darkest) < -0.1, seed
