@@ -206,7 +206,7 @@ def test_the_detail_of_the_end_is_no_louder_than_skin(hand, hands):
     after = close_wrist(hand, before._replace(colors=(before.colors * noise.exp()).clamp(max=1)), rest)
     on_end = (torch.cdist(centers(hand, rest, after), rest[hand.rim]).amin(1) < 0.3 * RIM_FADE).nonzero()[:, 0]
     logs = after.colors[on_end[on_end >= len(after.vertex_index)]].log()
-    assert 0.01 < (logs - logs.mean(0)).std() < 0.03
+    assert 0.01 < (logs - logs.mean(0)).std() < 0.04
 
 
 def test_the_hand_beyond_the_fade_keeps_its_bits_and_the_cap_goes_with_the_wrist(hand, hands):

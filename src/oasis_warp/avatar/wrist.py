@@ -39,8 +39,8 @@ AVERAGED = 32
 """Number of nearest Gaussians of that skin, 3 to 6 mm around; detail is the difference of one from their mean."""
 DARKEST = 0.02
 """Colours are clamped to it before their logarithm is taken [sRGB]."""
-CONTRAST = 0.02
-"""Largest standard deviation of that detail's logarithm, the finest contrast of real backs: more is the edge of a
+CONTRAST = 0.03
+"""Largest standard deviation of that detail's logarithm, the finest contrast of real palms: more is the edge of a
 shadow or of a sleeve."""
 RIM_PARTS = -1 / 3, 0.0, 1 / 3
 """Places of Gaussians along the edges at a vertex of the rim, as shares of the edge: one on each vertex makes teeth."""
