@@ -14,9 +14,11 @@ import torch
 from torch import Tensor
 
 from oasis_warp.assets import asset
+from oasis_warp.avatar.sky import harmonic_basis
 from oasis_warp.core.types import Photo
 from oasis_warp.estimation.estimator import choose_hand
 from oasis_warp.estimation.pixel_reading import read_pixels
+from oasis_warp.evaluation.band_energy import contrasts, split_bands
 from oasis_warp.network.dense_network import HAND, DenseNetwork, DensePrediction, load_dense_network, read_dense_header
 from oasis_warp.pretraining.dense_trainer import DensePhotos, detected
 from oasis_warp.synthetic.dense_pictures import UNIT, DenseBatch, render_dense
@@ -35,6 +37,8 @@ SHOWN = ("palm_flat_right_03.jpg", "two_fingers_dark_skin_16.jpg", "ok_sign_left
 GAMMA = 2.2
 BESIDE = 6
 """Width of the strip along arms and along what covers the hand, in which the end of the hand is hard to tell [px]."""
+EDGE = 4
+"""Width of the strip along the end of the skin that contrasts leave out [px]."""
 DARKEST = 1e-3
 """Reflectance below which its logarithm counts as this one's."""
 MEASURES = (
@@ -46,6 +50,9 @@ MEASURES = (
     Column("normal, median of a photo, degrees", "normal_deg", ".1f"),
     Column("finger, share of pixels right", "finger", ".3f"),
     Column("albedo, scale-free error of the logarithm", "albedo_log", ".3f"),
+    Column("the same of photo over nine harmonics of its light", "split_log", ".3f"),
+    Column("albedo's contrast over the truth's, 1-2 px", "contrast_1_2", ".2f"),
+    Column("the same, 2-4 px", "contrast_2_4", ".2f"), Column("the same, 4-8 px", "contrast_4_8", ".2f"),
     Column("shading, correlation of the logarithm", "shading", ".3f"),
 )
 
@@ -75,6 +82,10 @@ def errors(said: DensePrediction, true: DenseBatch, k: int) -> Row | None:
     mask, drawn = true.classes[k, HAND] > 0.5, said.classes[k].softmax(0)[HAND] > 0.5
     other = (true.classes[k].argmax(0) > HAND).float()[None]
     apart = torch.nn.functional.max_pool2d(other, 2 * BESIDE + 1, 1, BESIDE)[0] == 0
+    linear = _linear(true.image[k])[:, skin]
+    basis = harmonic_basis(said.normal[k][:, skin].T, 9)
+    lit = (basis @ torch.linalg.lstsq(basis, linear.T).solution).T
+    split = (linear / lit.clamp_min(DARKEST)).clamp_min(DARKEST).log()
     within = off.abs() / said.log_scale[k][skin].exp() < -torch.log(torch.tensor(1 - CLAIMED))
     return {
         "iou": iou(drawn, mask), "iou_apart": iou(drawn, mask, apart),
@@ -83,9 +94,24 @@ def errors(said: DensePrediction, true: DenseBatch, k: int) -> Row | None:
         "normal_deg": float(cosine.acos().rad2deg().median()),
         "finger": float((said.finger[k].argmax(0) == true.finger[k])[skin].float().mean()),
         "albedo_log": float((_centred(albedo) - _centred(known)).abs().mean()),
+        "split_log": float((_centred(split) - _centred(known)).abs().mean()), **contrast_ratios(said, true, k),
         "shading": float(torch.corrcoef(torch.stack([(light - albedo).mean(0), (light - known).mean(0)]))[0, 1]),
         "within": float(within.float().mean()),
     }  # fmt: skip
+
+
+def contrast_ratios(said: DensePrediction, true: DenseBatch, k: int) -> Row:
+    """Contrast of the predicted albedo over that of the true one, in three bands, away from the end of the skin."""
+    skin = true.skin[k]
+    inner = -torch.nn.functional.max_pool2d(-skin[None].float(), 2 * EDGE + 1, 1, EDGE)[0] > 0
+    found, wanted = (
+        contrasts([(split_bands(albedo.clamp_min(DARKEST).log().mean(0), skin.float()), inner)])
+        for albedo in (_linear(said.albedo[k]), true.albedo[k])
+    )
+    if found is None or wanted is None:
+        return {}
+    ratios = [a / b for a, b in zip(found, wanted, strict=True)]
+    return dict(zip(("contrast_1_2", "contrast_2_4", "contrast_4_8"), ratios[1:], strict=True))
 
 
 def half_a_pixel_off(mask: Tensor) -> list[Tensor]:
@@ -158,7 +184,8 @@ def side_by_side(groups: dict[str, list[Row]]) -> str | None:
     if not all(groups.values()):
         return None
     lines = [
-        [column.heading, *(column.text(percentiles(row[column.value] for row in rows)[1]) for rows in groups.values())]
+        [column.heading]
+        + [column.text(percentiles(row.get(column.value) for row in rows)[1]) for rows in groups.values()]
         for column in MEASURES
     ]
     return markdown(["median", *groups], lines)
