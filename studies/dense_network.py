@@ -14,11 +14,13 @@ import torch
 from torch import Tensor
 
 from oasis_warp.assets import asset
+from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.avatar.sky import harmonic_basis
 from oasis_warp.core.types import Photo
 from oasis_warp.estimation.estimator import choose_hand
 from oasis_warp.estimation.pixel_reading import read_pixels
 from oasis_warp.evaluation.band_energy import contrasts, split_bands
+from oasis_warp.evaluation.views import RIM
 from oasis_warp.network.dense_network import HAND, DenseNetwork, DensePrediction, load_dense_network, read_dense_header
 from oasis_warp.pretraining.dense_trainer import DensePhotos, detected
 from oasis_warp.synthetic.dense_pictures import UNIT, DenseBatch, render_dense
@@ -37,8 +39,6 @@ SHOWN = ("palm_flat_right_03.jpg", "two_fingers_dark_skin_16.jpg", "ok_sign_left
 GAMMA = 2.2
 BESIDE = 6
 """Width of the strip along arms and along what covers the hand, in which the end of the hand is hard to tell [px]."""
-EDGE = 4
-"""Width of the strip along the end of the skin that contrasts leave out [px]."""
 DARKEST = 1e-3
 """Reflectance below which its logarithm counts as this one's."""
 MEASURES = (
@@ -50,9 +50,10 @@ MEASURES = (
     Column("normal, median of a photo, degrees", "normal_deg", ".1f"),
     Column("finger, share of pixels right", "finger", ".3f"),
     Column("albedo, scale-free error of the logarithm", "albedo_log", ".3f"),
-    Column("the same of photo over nine harmonics of its light", "split_log", ".3f"),
+    Column("the same for the photo divided by a fit of nine harmonics", "split_log", ".3f"),
     Column("albedo's contrast over the truth's, 1-2 px", "contrast_1_2", ".2f"),
-    Column("the same, 2-4 px", "contrast_2_4", ".2f"), Column("the same, 4-8 px", "contrast_4_8", ".2f"),
+    Column("albedo's contrast over the truth's, 2-4 px", "contrast_2_4", ".2f"),
+    Column("albedo's contrast over the truth's, 4-8 px", "contrast_4_8", ".2f"),
     Column("shading, correlation of the logarithm", "shading", ".3f"),
 )
 
@@ -103,7 +104,7 @@ def errors(said: DensePrediction, true: DenseBatch, k: int) -> Row | None:
 def contrast_ratios(said: DensePrediction, true: DenseBatch, k: int) -> Row:
     """Contrast of the predicted albedo over that of the true one, in three bands, away from the end of the skin."""
     skin = true.skin[k]
-    inner = -torch.nn.functional.max_pool2d(-skin[None].float(), 2 * EDGE + 1, 1, EDGE)[0] > 0
+    inner = inner_mask(skin.float(), RIM) > 0
     found, wanted = (
         contrasts([(split_bands(albedo.clamp_min(DARKEST).log().mean(0), skin.float()), inner)])
         for albedo in (_linear(said.albedo[k]), true.albedo[k])

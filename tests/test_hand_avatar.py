@@ -241,8 +241,8 @@ def test_a_gpu_poses_what_the_cpu_poses_in_a_graph_too(side, left, right, tmp_pa
         part.copy_(new)
     graph.replay()
     want, eager = here.pose(pose), there.pose(pose)
-    # The last bit of a vertex half a metre away, 6e-8 m, turns a face of .3 mm by 2e-4; where skin touches, vertices
-    # differ by several such bits and faces are smaller: 7 of 147,524 numbers differed by 5e-4 to 8e-4.
+    # Vertices half a metre away are rounded to 6e-8 m. Such a change of each vertex of a fist turns small faces so far
+    # that numbers of quaternions differ by up to 8e-4, two such changes by 1.6e-3.
     for ours, again, theirs, off in zip(captured[:3], eager[:3], want[:3], (1e-5, 2e-3, 1e-5), strict=True):
         assert torch.equal(ours, again)
         torch.testing.assert_close(ours.cpu(), theirs, atol=off, rtol=0)

@@ -125,7 +125,7 @@ def test_a_photo_with_crisp_skin_gets_crisper_skin_painted(hand, palm_photo):
         made = paint(hand, palm_photo, observations=seen._replace(colors=seen.colors * (contrast * noise).exp()))
         where = unseen_back(hand, made)
         found.append(float(detail_of(hand, vertex_colors(made.gaussians, len(where)), where)))
-    assert found[1] > 1.35 * found[0]  # blotches and relief are the same
+    assert found[1] > 1.45 * found[0]  # relief and blotches do not depend on it
 
 
 def test_the_photo_looks_as_before_in_its_own_view(hand, palm_photo, painted):

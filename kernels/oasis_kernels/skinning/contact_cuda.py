@@ -1,4 +1,4 @@
-"""Contact on CUDA: `contact.cu`, the rules of `contact`, by warps and parts of them."""
+"""Contact on CUDA: `contact.cu`, the rules of `contact`, by warps and by `LANES` lanes."""
 
 from oasis_kernels.runtime.cuda_native import CudaNative, cuda_native
 
@@ -6,7 +6,7 @@ BLOCK = 128
 """Threads of a block."""
 WARPS = BLOCK // 32
 LANES = 8
-"""Threads that work on a vertex in `contacts` and `spread`: most have 16 to 24 neighbours."""
+"""Threads that work on a vertex in `contacts` and `spread`, a power of two below 32: most have 16 to 24 neighbours."""
 
 
 def _build(name: str, label: str) -> CudaNative:
