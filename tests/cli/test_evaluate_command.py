@@ -3,6 +3,8 @@
 import json
 import re
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
@@ -15,6 +17,7 @@ from oasis_warp.cli.developer_options import Evaluate
 from oasis_warp.cli.progress import BAD_INPUT, INTERRUPTED
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
+from oasis_warp.core.types import Render
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture
 from oasis_warp.estimation.estimator import HandEstimator
@@ -79,6 +82,22 @@ def test_a_wrong_colour_on_half_the_hand_is_found(scene, hand):
     assert score.psnr < right.psnr - 10
     assert score.ssim_quarter < right.ssim_quarter
     assert score.overlap == right.overlap
+
+
+def test_contrast_is_compared_by_size_of_detail_and_only_in_pictures_of_its_size(scene):
+    """A blurred avatar has lost the fine detail of the photo, and keeps the coarse; an equal one has all of it."""
+    photo, fit, avatar = scene
+    crop = crop_hand(photo, fit, avatar.surface_offsets, ReconstructConfig(size=256))
+    rough = np.random.default_rng(0).normal(0.6, 0.1, (256, 256, 1)).astype(np.float32)
+    crop = crop._replace(image=torch.from_numpy(rough).clamp(0, 1).expand(-1, -1, 3))
+    blurred = torch.from_numpy(cv2.GaussianBlur(rough, (0, 0), 2.0))[..., None].expand(-1, -1, 3)
+    equal, soft = (
+        compare_with_photo(avatar, Render(image, torch.ones(256, 256)), crop, fit.pose).contrasts
+        for image in (crop.image, blurred)
+    )
+    assert equal == pytest.approx([1.0] * 4)
+    assert soft[0] < 0.1 < soft[1] < soft[2] < 0.7 < soft[3] < 1.0
+    assert score_in(scene, photo).contrasts is None
 
 
 def test_every_ordered_pair_is_compared_and_the_second_photo_is_fitted_with_the_firsts_shape(scene):

@@ -26,13 +26,14 @@ from oasis_warp.evaluation.band_energy import (
 )
 from oasis_warp.evaluation.kernel_distance import Sample, hand_features
 from oasis_warp.evaluation.pictures import Cell
-from oasis_warp.evaluation.real_hands import mostly_shows, read_crop, side_masks
+from oasis_warp.evaluation.real_hands import mostly_shows, side_masks
 from oasis_warp.evaluation.summary import Record
 from oasis_warp.evaluation.views import (
     DRAWN_SIZE,
     Surface,
     View,
     draw,
+    read_crop,
     read_surface,
     shrink,
     silhouette,

@@ -11,8 +11,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.assets import asset
-from oasis_warp.avatar.appearance import label_regions
-from oasis_warp.avatar.observation import inner_mask, observe
 from oasis_warp.avatar.quality import SEEN
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.types import HandCrop, Photo
@@ -22,7 +20,7 @@ from oasis_warp.evaluation.band_energy import SIZE, contrasts, darkest_over_medi
 from oasis_warp.evaluation.kernel_distance import hand_features
 from oasis_warp.evaluation.same_hand import photos_in
 from oasis_warp.evaluation.summary import Record
-from oasis_warp.evaluation.views import GROUND, RIM, Surface, read_surface
+from oasis_warp.evaluation.views import GROUND, Surface, read_crop
 from oasis_warp.hand.template import bundled_hand
 
 PALM, BACK = 0.7, 0.3
@@ -70,15 +68,6 @@ def measure_real(photo: Photo, estimator: HandEstimator) -> Record:
         "darkest": darkest_over_median(crop.image, sides["palm"]),
         "features": hand_features(over_ground(crop), crop.mask),
     }
-
-
-def read_crop(crop: HandCrop) -> Surface:
-    """What a photo's crop of `SIZE` shows, its interior that of mesh and mask together."""
-    hand = bundled_hand()
-    seen = observe(hand, crop).confidence
-    surface = read_surface(hand, crop.posed.vertices, crop.camera, seen, label_regions(hand).palm)
-    mask = (inner_mask(crop.mask, RIM) > 0.5) & (crop.above_wrist > 0.5)
-    return surface._replace(interior=surface.interior & mask)
 
 
 def over_ground(crop: HandCrop) -> Float[Tensor, "S S 3"]:

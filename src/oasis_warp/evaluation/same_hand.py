@@ -25,10 +25,12 @@ from oasis_warp.data.output_files import open_resumable_folder, write_file
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.estimation.hand_crop import crop_hand, initial_offsets
+from oasis_warp.evaluation.band_energy import BANDS, SIZE, Contrasts, contrasts, log_brightness, split_bands
 from oasis_warp.evaluation.methods import EVEN, KEEP, ONE_SHOT, RAW, Method, method_name, prior_digest
 from oasis_warp.evaluation.metrics import COVERED, color_gain
 from oasis_warp.evaluation.pictures import tile, write_sheet, write_strip
 from oasis_warp.evaluation.summary import Record, read_result, select
+from oasis_warp.evaluation.views import read_crop
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar, draw_as_photo, make_avatar
 from oasis_warp.losses import masked_psnr, ssim_map
@@ -50,10 +52,11 @@ SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp"})
 SHOWN = 2
 """Pairs of each hand on the sheet."""
 DIGITS = 5
+CONTRASTS = tuple(f"contrast {band}" for band in BANDS)
 MEASURES = (
-    "psnr", "psnr_plain", "ssim_quarter", "overlap", "error", "error_palm", "error_back", "error_nail"
+    "psnr", "psnr_plain", "ssim_quarter", "overlap", "error", "error_palm", "error_back", "error_nail", *CONTRASTS
 )  # fmt: skip
-"""Measures of a pair; a colour error is missing where too little of the region is seen."""
+"""Measures of a pair; a colour error or the contrasts are missing where too little of the skin is seen."""
 QUARTER = 4
 """Side of the blocks on which structure is compared [px]: a small pose error moves all detail."""
 MIN_VERTICES = 20
@@ -73,6 +76,9 @@ class PairScore(NamedTuple):
     """Distance of the mean colours of each region that the other photo shows [sRGB], after the gain."""
     overlap: float
     """Intersection over union of the drawn hand and the other photo's mask."""
+    contrasts: Contrasts | None
+    """Contrast of the drawn skin over that of the other photo, by the size of detail (`band_energy.BANDS`); None where
+    too little is seen, or where pictures are not of `band_energy.SIZE`."""
 
 
 class Pair(NamedTuple):
@@ -133,7 +139,17 @@ def compare_with_photo(avatar: Avatar, drawn: Render, crop: HandCrop, pose: Hand
         ssim_quarter=_small_ssim(matched, crop.image, weight),
         region_errors=_region_errors(avatar, avatar.pose(pose).colors, crop, gain),
         overlap=float((covered & mask).sum() / (covered | mask).sum().clamp_min(1)),
+        contrasts=_contrast_ratios(image, alpha, crop) if len(image) == SIZE else None,
     )
+
+
+def _contrast_ratios(image: Tensor, alpha: Tensor, crop: HandCrop) -> Contrasts | None:
+    """Contrasts of what was drawn over those of the photo, on the same pixels, away from all outlines."""
+    where = read_crop(crop).interior & (alpha >= COVERED)
+    own, true = (
+        contrasts([(split_bands(log_brightness(picture), where.to(picture)), where)]) for picture in (image, crop.image)
+    )
+    return None if own is None or true is None else tuple(a / max(b, 1e-6) for a, b in zip(own, true, strict=True))
 
 
 def _small_ssim(image: Tensor, target: Tensor, weight: Tensor) -> float:
@@ -306,6 +322,8 @@ def _record(hand: str, pair: Pair, method: Method) -> Record:
     numbers |= {f"error_{region}": value for region, value in errors.items()}
     if errors:
         numbers["error"] = statistics.fmean(errors.values())
+    if score.contrasts is not None:
+        numbers |= dict(zip(CONTRASTS, score.contrasts, strict=True))
     return {
         "hand": hand,
         "source": pair.source,

@@ -156,6 +156,7 @@ PHOTOS = {
     "error_palm": Measure("colour of the palm", ".3f"),
     "error_back": Measure("of the back", ".3f"),
     "error_nail": Measure("of the nails", ".3f"),
+    **{f"contrast {band}": Measure(f"contrast {band} px", ".2f") for band in BANDS},
     "beaten_psnr": Measure("one-shot better by PSNR", ".0%"),
     "beaten_ssim_quarter": Measure("by SSIM", ".0%"),
     "beaten_error": Measure("by colours", ".0%"),

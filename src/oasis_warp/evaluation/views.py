@@ -10,14 +10,16 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
-from oasis_warp.avatar.observation import facing, inner_mask
+from oasis_warp.avatar.appearance import label_regions
+from oasis_warp.avatar.observation import facing, inner_mask, observe
 from oasis_warp.core.camera import crop_camera, orbit_camera, project
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.surface import face_normals
-from oasis_warp.core.types import Camera, HandPose, Render
+from oasis_warp.core.types import Camera, HandCrop, HandPose, Render
 from oasis_warp.estimation.hand_crop import CROP_MARGIN
 from oasis_warp.evaluation.band_energy import SIZE
 from oasis_warp.hand.poses import POSE_NAMES
+from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import depth_map
 
@@ -118,6 +120,15 @@ def read_surface(
     normals, _ = face_normals(vertices, faces)
     outside = facing(vertices[faces].mean(1), -normals if left else normals, small.viewmat.to(vertices))[ids] > 0
     return Surface(silhouette, silhouette & outside & clear_of_outlines(seen.depth), shown, side)
+
+
+def read_crop(crop: HandCrop) -> Surface:
+    """What a photo's crop of `SIZE` shows, its interior that of mesh and mask together."""
+    hand = bundled_hand()
+    seen = observe(hand, crop).confidence
+    surface = read_surface(hand, crop.posed.vertices, crop.camera, seen, label_regions(hand).palm)
+    mask = (inner_mask(crop.mask, RIM) > 0.5) & (crop.above_wrist > 0.5)
+    return surface._replace(interior=surface.interior & mask)
 
 
 def silhouette(faces: Int[Tensor, "F 3"], vertices: Float[Tensor, "V 3"], camera: Camera) -> Bool[Tensor, "H W"]:
