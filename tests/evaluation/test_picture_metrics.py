@@ -28,7 +28,7 @@ def square(value=0.5, hidden=None, stretched=None, squeezed=None):
     nowhere = torch.zeros(SIDE, SIDE, dtype=torch.bool)
     return TargetTruth(
         value * mask[..., None].expand(-1, -1, 3), mask, torch.ones_like(mask),
-        *(nowhere if part is None else part for part in (hidden, stretched, squeezed)),
+        *(nowhere if part is None else part for part in (hidden, stretched, squeezed)), mask > 0.5,
     )  # fmt: skip
 
 
@@ -51,6 +51,25 @@ def test_an_error_of_a_tenth_is_20_db():
     found = score(truth.image + 0.1, truth)
     assert found["psnr"] == pytest.approx(20, abs=1e-4)
     assert found["psnr_inner"] == pytest.approx(20, abs=1e-4)
+
+
+def test_hidden_skin_is_compared_in_contrast_and_likeness():
+    """A mean has less contrast and more likeness than another sample, which has all contrast and none of the rest."""
+    random = torch.Generator().manual_seed(0)
+    everywhere = torch.ones(256, 256, dtype=torch.bool)
+    detail, other = torch.randn(2, 256, 256, 1, generator=random)
+
+    def picture(part):
+        return (0.5 * (0.1 * part).exp()).expand(-1, -1, 3)
+
+    truth = TargetTruth(picture(detail), everywhere.float(), everywhere.float(), *[everywhere] * 4)
+    half, sample = score(picture(0.5 * detail), truth), score(picture(other), truth)
+    for band in BANDS:
+        assert half[f"hidden contrast {band}"] == pytest.approx(0.5, rel=0.02)
+        assert half[f"hidden likeness {band}"] == pytest.approx(1.0, abs=0.01)
+        assert sample[f"hidden contrast {band}"] == pytest.approx(1.0, abs=0.25)
+        assert abs(sample[f"hidden likeness {band}"]) < 0.2
+    assert score(picture(detail), truth._replace(hidden=~everywhere))["hidden contrast <1"] is None
 
 
 def test_errors_at_the_outline_do_not_count_inside():

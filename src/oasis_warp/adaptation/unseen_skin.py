@@ -19,7 +19,7 @@ from oasis_warp.avatar.densify import densify, part_centers
 from oasis_warp.avatar.observation import observe
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import TIP_JOINTS, HandModel
-from oasis_warp.core.types import CanonicalGaussians, HandCrop, PosedHand
+from oasis_warp.core.types import CanonicalGaussians, HandCrop
 from oasis_warp.hand.template import bundled_hand
 
 LIGHTEST, DARKEST, TONES = 0.006, 0.35, 25
@@ -227,7 +227,7 @@ def paint_unseen(
     form = (relief_shade(hand, seed) + flush_shade(hand, seed)).to(rest) * ((1 - nail) * unknown)[:, None]
     read = vertex_to_gaussians(
         torch.cat([
-            tone.log_skin + form + smooth, smooth + GLOSS * _nail_gloss(hand, crop.rest)[:, None],
+            tone.log_skin + form + smooth, smooth + GLOSS * _nail_gloss(hand, rest)[:, None],
             torch.stack([palm, invented, shown], 1),
         ], 1),
         faces,
@@ -267,13 +267,14 @@ def _unseen_share(hand: HandModel, confidence: Float[Tensor, "V"]) -> Float[Tens
     return torch.minimum(smooth, (hidden > 0).to(smooth))[:, 0]
 
 
-def _nail_gloss(hand: HandModel, rest: PosedHand) -> Float[Tensor, "V"]:
+def _nail_gloss(hand: HandModel, rest: Float[Tensor, "V 3"]) -> Float[Tensor, "V"]:
     """A stripe along each nail, where it reflects the sky: paint, which goes with the nail and not with the view."""
-    normals = surface.vertex_normals(rest.vertices, hand.faces.to(rest.vertices.device))
+    normals = surface.vertex_normals(rest, hand.faces.to(rest.device))
     on_nail, gloss = label_regions(hand).nail.to(normals), torch.zeros_like(normals[:, 0])
     for joint in TIP_JOINTS:
-        own = (hand.segment.to(normals.device) == joint) & (on_nail > 0)
-        along = rest.vertices[own].mean(0) - rest.joints[joint]
+        on_bone = hand.segment.to(rest.device) == joint
+        own, place = on_bone & (on_nail > 0), hand.bone_t.to(rest)[on_bone, None]
+        along = ((place - place.mean()) * rest[on_bone]).sum(0)
         across = normalize(torch.linalg.cross(normals[own].mean(0), along), dim=0)
         stripe = (-(((normals[own] @ across - GLOSS_AT) / GLOSS_WIDTH) ** 2)).exp()
         gloss[own] = stripe - stripe.mean()

@@ -216,6 +216,8 @@ class Pretrain:
     backbone_weights: Path | None = None
     """DINOv2's model.safetensors, for the paper's profile."""
     lpips: LpipsWeights = None
+    sharp: bool = False
+    """For the prior: on skin that the photo hides, let a patch discriminator judge detail instead of its mean."""
     allow_download: AllowDownload = False
     initial_weights: Annotated[Path | None, arg(aliases=["--start"])] = None  # torchrun takes --start for its own
     """Initial weights: a network.safetensors of the same task and profile. Default: random."""

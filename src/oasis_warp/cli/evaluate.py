@@ -27,6 +27,7 @@ from oasis_warp.evaluation.summary import (
     BLEMISHES,
     COLORS,
     GROUPS,
+    HIDDEN,
     LIGHTS,
     LOOKS,
     PHOTOS,
@@ -55,6 +56,8 @@ REAL_SECONDS, LOOKS_SECONDS, AVATAR_SECONDS, PAIR_SECONDS = 2.5, 17.0, 10.0, 0.6
 process with one thread, for two photos of the tests, in November 2026. Only ratios matter."""
 AVATARS_PER_PHOTO = 4
 """Avatars made of each photo for pairs: without the learned prior, and with it in each of three lights."""
+HIDDEN_LIGHT = "studio"
+"""Light of the pictures in which hidden skin is compared: any other adds the contrast of its own shading."""
 PUBLISHED = ("interhand", "hanco", "coco-hand", "whim")
 TABLE_WIDTH = 120
 """Width of tables where there is no terminal, or a narrow one [characters]."""
@@ -163,6 +166,8 @@ def on_synthetic_hands(options: Evaluate, priors: dict[str, Prior], progress: Pr
             rows = select(summary, group=group, light=light, colors=COLORS[light])
             rows = [row for row in rows if row["noise"] in config.noise]
             tables.append(make_table(f"{GROUPS[group]}, {LIGHTS[light]}", rows, SYNTHETIC))
+            if (group, light) == (config.groups[0], HIDDEN_LIGHT):
+                tables.append(make_table(f"Skin that the photo hides; {GROUPS[group]}, {LIGHTS[light]}", rows, HIDDEN))
     return [*tables, noise_table(summary, config)]
 
 

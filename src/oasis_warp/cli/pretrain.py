@@ -33,6 +33,7 @@ from oasis_warp.pretraining.dense_trainer import DensePhotos, DenseTrainer
 from oasis_warp.pretraining.distributed import ProcessInfo, join_processes, wait_for_all
 from oasis_warp.pretraining.pretrain import CHECKPOINT, BatchSource, PretrainConfig, Trainer, pretrain
 from oasis_warp.pretraining.prior_trainer import PriorTrainer
+from oasis_warp.pretraining.sharp_prior import SharpPriorTrainer
 from oasis_warp.pretraining.synthetic_source import MULTIPLE, SyntheticHands
 from oasis_warp.synthetic.people import max_people_cached
 from oasis_warp.synthetic.shots import EVERYBODY, PICTURES_EACH
@@ -98,7 +99,7 @@ def check_options(options: Pretrain) -> None:
     if options.task == "prior":
         check_prior_options(options)
     else:
-        for name in ("profile", "views", "hold_out", "backbone_weights", "lpips", "data"):
+        for name in ("profile", "views", "hold_out", "backbone_weights", "lpips", "data", "sharp"):
             if getattr(options, name) != getattr(Pretrain, name, None):
                 raise InputError(f"--{name.replace('_', '-')}: works only with --task prior; leave it out.")
 
@@ -209,10 +210,13 @@ def make_trainer(options: Pretrain, process: ProcessInfo) -> Trainer:
         return DenseTrainer(make_dense_network(options.seed, options.initial_weights), config, process)
     config = PretrainConfig(steps=options.steps, precision=precision)
     network = make_network(PROFILES[options.profile], options.seed, options.backbone_weights, options.initial_weights)
-    if options.lpips is None:
-        return PriorTrainer(network, config, process)
-    perceptual = load_lpips(*options.lpips, allow_download=options.allow_download)
-    return PriorTrainer(network, config, process, perceptual=perceptual.to(process.device))
+    losses: dict[str, Any] = {}
+    if options.lpips is not None:
+        perceptual = load_lpips(*options.lpips, allow_download=options.allow_download)
+        losses["perceptual"] = perceptual.to(process.device)
+    if options.sharp:
+        return SharpPriorTrainer(network, config, process, seed=options.seed, **losses)
+    return PriorTrainer(network, config, process, **losses)
 
 
 def make_dense_network(seed: int, start: Path | None) -> DenseNetwork:
@@ -253,6 +257,8 @@ def settings_of(options: Pretrain, processes: int) -> dict[str, Any]:
     else:
         settings |= {name: getattr(options, name) for name in ("profile", "views")}
         settings["hold_out"] = sorted(options.hold_out)
+        if options.sharp:
+            settings["sharp"] = True
     files = {"backbone": options.backbone_weights, "start": options.initial_weights}
     if options.lpips is not None:
         files |= dict(zip(("lpips_trunk", "lpips"), options.lpips, strict=True))

@@ -319,7 +319,7 @@ def target_truth(
     known = torch.from_numpy(above).to(device, torch.float32)
     mask, nowhere = fit.mask.to(device) * known, torch.zeros_like(known, dtype=torch.bool)
     image = sample.photo.rgb.to(device) / 255 * mask[..., None]
-    return TargetTruth(image, mask, known, nowhere, nowhere, nowhere), camera, fit.pose
+    return TargetTruth(image, mask, known, nowhere, nowhere, nowhere, nowhere), camera, fit.pose
 
 
 def _measured(image: Tensor, truth: TargetTruth, perceptual: Perceptual | None) -> Record:

@@ -14,6 +14,7 @@ from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.surface import faces_of_vertices
 from oasis_warp.core.types import TrainingBatch
 from oasis_warp.evaluation.metrics import TargetTruth
+from oasis_warp.evaluation.views import clear_of_outlines
 from oasis_warp.ops import depth_map
 from oasis_warp.pretraining.prior_trainer import true_pictures
 from oasis_warp.pretraining.synthetic_source import ERROR_STREAM, SURROUNDINGS, seeded
@@ -158,6 +159,7 @@ def target_truths(batch: TrainingBatch, hand: HandModel) -> list[TargetTruth]:
                 on_hand & (shown < 0.5),
                 on_hand & (ratio > STRETCH),
                 on_hand & (ratio < 1 / STRETCH),
+                on_hand & clear_of_outlines(seen.depth[k]),
             )
         )
     return truths

@@ -10,6 +10,7 @@ import torch
 from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.adaptation.prior_guess import calibrate
 from oasis_warp.adaptation.unlit import view_in_photo
+from oasis_warp.adaptation.unseen_skin import paint_unseen
 from oasis_warp.avatar.pose import in_even_light
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.config import AdaptConfig
@@ -20,9 +21,11 @@ from oasis_warp.network.prior import NetworkPrior, guess_with_heads
 from oasis_warp.network.weights_file import trained_state
 
 RAW, CALIBRATED, EVEN, KEEP, ONE_SHOT = "raw", "calibrated", "even_one_shot", "keep_one_shot", "one_shot"
-STAGES = (RAW, CALIBRATED, EVEN, KEEP, ONE_SHOT)
+PAINTED = "painted"
+STAGES = (RAW, CALIBRATED, EVEN, KEEP, ONE_SHOT, PAINTED)
 """The prior's guess; its colours matched to the photo's as a whole; adapted to what is likelier albedo than shading;
-adapted to all that the photo shows, with its light baked in; the same with the light apart, as avatars ship."""
+adapted to all that the photo shows, with its light baked in; the same with the light apart; and with painted unseen
+skin, as avatars ship."""
 
 
 class Method(NamedTuple):
@@ -118,9 +121,15 @@ def reconstructions(
             _, view, trusted = view_in_photo(hand, guess, crop)
             calibration = calibrate(view, guess.colors, crop.image, trusted, config)
             yield Method(name, CALIBRATED), LitGaussians(guess._replace(colors=calibration.apply(guess.colors)))
-        for stage, settings in (
-            (EVEN, replace(config, light="even")), (KEEP, replace(config, light="keep")), (ONE_SHOT, config)
-        ):  # fmt: skip
+        for stage, settings in ((EVEN, replace(config, light="even")), (KEEP, replace(config, light="keep"))):
             if stage in stages:
                 adapted = adapt(hand, [guess], [crop], settings, heads=heads, perceptual=perceptual)
                 yield Method(name, stage), LitGaussians(adapted.gaussians, adapted.light)
+        if stages & {ONE_SHOT, PAINTED}:
+            adapted = adapt(hand, [guess], [crop], config, heads=heads, perceptual=perceptual)
+            if ONE_SHOT in stages:
+                yield Method(name, ONE_SHOT), LitGaussians(adapted.gaussians, adapted.light)
+            if PAINTED in stages:
+                shown = adapted.observations
+                painted = paint_unseen(hand, adapted.gaussians, adapted.guess, crop, shown, seed=config.seed)
+                yield Method(name, PAINTED), LitGaussians(painted.gaussians, adapted.light)

@@ -10,6 +10,8 @@ from torch import Tensor
 from oasis_warp.avatar.anchors import OPACITY, place_anchors
 from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.core.camera import orbit_camera
+from oasis_warp.evaluation import band_energy
+from oasis_warp.evaluation.band_energy import BANDS, KEPT, SIZE, log_brightness, split_bands
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses import Perceptual, ssim_map
 from oasis_warp.ops import depth_map
@@ -25,9 +27,11 @@ ERROR_FLOOR = 1e-12
 
 Scores = dict[str, float | None]
 """By name of the measure; None where it cannot be measured."""
+HIDDEN_CONTRASTS = tuple(f"hidden contrast {band}" for band in BANDS)
+HIDDEN_LIKENESS = tuple(f"hidden likeness {band}" for band in BANDS)
 MEASURES = (
     "psnr", "psnr_inner", "ssim", "ssim_box", "ssim_mask", "lpips", "psnr_visible", "psnr_hidden", "psnr_stretched",
-    "psnr_squeezed", "psnr_unchanged",
+    "psnr_squeezed", "psnr_unchanged", *HIDDEN_CONTRASTS, *HIDDEN_LIKENESS,
 )  # fmt: skip
 
 
@@ -46,6 +50,8 @@ class TargetTruth(NamedTuple):
     """Skin that the pose has stretched."""
     squeezed: Bool[Tensor, "H W"]
     """Skin that the pose has squeezed, as inside bent joints: its folds are darker than skin at rest."""
+    interior: Bool[Tensor, "H W"]
+    """Surface away from all outlines, those inside the hand included."""
 
 
 def score(image: Float[Tensor, "H W 3"], truth: TargetTruth, perceptual: Perceptual | None = None) -> Scores:
@@ -53,6 +59,7 @@ def score(image: Float[Tensor, "H W 3"], truth: TargetTruth, perceptual: Percept
 
     PSNR [dB] weighs pixels by the mask. The inner PSNR and those of parts leave out two pixels at the outline, which
     depend on the shape. SSIM is the mean over the whole picture, the mask's box, and the mask. LPIPS is of the hand.
+    Of hidden skin there are its contrast over the truth's and its likeness (`compare_hidden_skin`).
     """
     drawn = image.clamp(0, 1) * truth.known[..., None]
     mask, error = truth.mask, (drawn - truth.image).square().mean(-1)
@@ -80,7 +87,26 @@ def score(image: Float[Tensor, "H W 3"], truth: TargetTruth, perceptual: Percept
         "unchanged": ~(truth.stretched | truth.squeezed),
     }.items():
         scores[f"psnr_{name}"] = _psnr(error, inner * part)
-    return scores
+    return scores | compare_hidden_skin(drawn, truth)
+
+
+def compare_hidden_skin(drawn: Float[Tensor, "H W 3"], truth: TargetTruth) -> Scores:
+    """Contrast of hidden skin over the truth's and correlation with it, in each of `band_energy.BANDS`.
+
+    Those pixels count on which the truth has least contrast (`KEPT`). None of other sizes than `SIZE`, or too little
+    skin.
+    """
+    names = (*HIDDEN_CONTRASTS, *HIDDEN_LIKENESS)
+    where = truth.hidden & truth.interior & (truth.mask > 0.5) & (inner_mask(truth.known) > 0.5)
+    if len(drawn) != SIZE or int(where.sum()) < band_energy.MIN_PIXELS:
+        return dict.fromkeys(names)
+    weight = where.to(drawn)
+    own, true = (split_bands(log_brightness(picture), weight)[:, where] for picture in (drawn, truth.image))
+    kept = true.square() <= true.square().quantile(KEPT, 1, keepdim=True)
+    own, true = own * kept, true * kept
+    energy, wanted = own.square().sum(1), true.square().sum(1).clamp_min(ERROR_FLOOR)
+    likeness = (own * true).sum(1) / (energy * wanted).sqrt().clamp_min(ERROR_FLOOR)
+    return dict(zip(names, [*(energy / wanted).sqrt().tolist(), *likeness.tolist()], strict=True))
 
 
 def _psnr(error: Tensor, weight: Tensor) -> float | None:

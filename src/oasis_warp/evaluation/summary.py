@@ -149,6 +149,12 @@ SYNTHETIC = {
     "lpips": Measure("LPIPS", ".4f"),
 }
 """Columns of `summary.summarise`."""
+HIDDEN = {
+    "psnr_hidden": Measure("PSNR", ".2f"),
+    **{f"hidden contrast {band}": Measure(f"contrast {band} px", ".2f") for band in BANDS},
+    **{f"hidden likeness {band}": Measure(f"likeness {band} px", ".2f") for band in BANDS},
+}
+"""Columns of skin that the photo hides, of the same rows."""
 PHOTOS = {
     "psnr": Measure("PSNR, dB", ".2f"),
     "psnr_plain": Measure("without a gain", ".2f"),

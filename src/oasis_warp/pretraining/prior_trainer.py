@@ -102,20 +102,22 @@ def objective(
     true: RenderBatch,
     config: LossConfig,
     perceptual: Perceptual = detail_difference,
+    compared: Float[Tensor, "N H H"] | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """The weighted sum of all terms, and each term without its weight: means over pictures and Gaussians.
 
     Colours are compared inside the mask and over black, so holes cost twice; only the mask term counts what is rendered
-    outside.
+    outside. With `compared` each pixel's colours count by this share, too.
     """
     images, alphas = drawn
     targets, masks = true
+    colored = masks if compared is None else masks * compared
     areas = masks.sum((1, 2)).clamp_min(MIN_AREA * masks[0].numel())
     terms = {
-        "rgb": torch.vmap(masked_l1)(images, targets, masks).mean(),
+        "rgb": torch.vmap(masked_l1)(images, targets, colored).mean(),
         "mask": ((alphas - masks).abs().sum((1, 2)) / areas).mean(),
-        "ssim": torch.vmap(masked_dssim)(images, targets, masks).mean(),
-        "perceptual": perceptual(images, targets, masks).mean(),
+        "ssim": torch.vmap(masked_dssim)(images, targets, colored).mean(),
+        "perceptual": perceptual(images, targets, colored).mean(),
         "position": position_loss(prediction.offsets, config.offset_limit),
         "scaling": scaling_loss(prediction.scales, prediction.anchor_scales, config.stretch_limit),
     }
