@@ -7,7 +7,7 @@ import torch
 import trimesh
 from synthetic import PALM_TO_CAMERA, crop_of
 
-from oasis_warp.adaptation import reliability
+from oasis_warp.adaptation import reliability, scraps
 from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.adaptation.inpainting import FADE_LENGTH, inpaint, laplacian_and_mass
 from oasis_warp.adaptation.reliability import mask_unreliable
@@ -347,6 +347,24 @@ def test_what_is_read_as_another_place_does_not_count(hand, shown):
 
 def grown(where, pixels):
     return inner_mask(-where.float(), pixels) < 0
+
+
+def test_a_dark_scrap_beside_a_finger_does_not_count_and_a_crease_in_the_palm_does(hand):
+    """Gaps and shadows beside a bent finger were dark scabs at its base as soon as it was opened."""
+    crop, *_ = crop_of(hand, torch.full_like(hand.template, 0.5), pose_name="ok", size=128, orientation=PALM_TO_CAMERA)
+    seen = depth_map(crop.posed.vertices, hand.faces, crop.camera.viewmat, crop.camera.K, 128, 128, validate=False)
+    place, nail = scraps._read(hand, seen)
+    outlines = scraps._outlines(seen.face_ids >= 0, place)
+    skin = (seen.face_ids >= 0) & (nail < 0.5)
+    beside = (scraps.largest(outlines.inside.float(), 2) > 0) & skin
+    far = (scraps.largest((outlines.inside | outlines.around).float(), 6) == 0) & skin
+    assert int(beside.sum()) > 100 and int(far.sum()) > 100
+    lines = torch.arange(128)[:, None] % 8 == 0  # dark ones all over
+    dark = torch.where(lines[..., None], 0.6, 1.0) * crop.image
+    found = scraps.scrap_share(hand, crop.image, crop._replace(image=dark), seen)
+    assert float(found[beside & lines].mean()) > 0.9
+    assert float(found[far].max()) == 0 and float(found[beside & ~lines].mean()) < 0.1
+    assert float(scraps.scrap_share(hand, crop.image, crop, seen).max()) == 0
 
 
 def test_what_lies_just_behind_a_finger_does_not_count(hand, shown):
