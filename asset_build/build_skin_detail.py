@@ -35,7 +35,8 @@ HANDS = {
     "middleage_lightskinned_male_diffuse2": 1.4,
     "skin_male_african_middleage": 0.65,
 }
-"""With each the gain of its detail: folds of dark skin are darker than those of light skin."""
+"""With each the gain of its detail: folds of dark skin are darker than those of light skin. The first one's fingers are
+smooth on the palm's side, with red pads in a frame of paint: there it takes the second one's detail."""
 LOW, SPAN = (0.361408, 0.011539), 0.192729
 """Corner and side of the hand's texture coordinates in those of the body."""
 BOX = (732, 1621, 411, 412)
@@ -54,6 +55,11 @@ FINE, FINE_GAIN = 1.2, 2.5
 DARKER, COLOUR = (0.82, 1.06, 1.12), 0.3
 """How much each channel's logarithm changes in the shade of a fold, the colour of all that is fine but for a share: the
 maps' own is that of blocks of JPEG."""
+SOFT, ON_PALM_FINGERS, EVEN_REACH = 0.6, 3.0, 9.0
+"""Blurs [texels] of palms, of what is taken off the palm's side of fingers, and over which contrast is measured."""
+PALM_CONTRAST, FLAT, PALM_LOUDEST, EVENINGS = 0.04, 0.012, 0.08, 2
+"""Root mean square of the logarithms of a palm's detail, contrast below which skin is left smoother, and what this
+detail tends to; how often it is divided by its contrast and limited. Set by eye, as the blurs, on drawn hands."""
 RIM = 3.0
 """Width of the islands' rims over which detail fades in: what lies beside them bled into them [texels]."""
 GREY, STEPS = 128, 400
@@ -63,6 +69,9 @@ PEOPLE, PALMS, LOUDEST_LINE = (3, 8), (4, 9), 2.0
 lines are taken; the strength of a line that is stored as 255. The photos' own lines are blurred."""
 PALM_LINES = {"crease": 1.4, "main": 1.35, "minor": 0.7, "halo": 0.3}
 """How dark lines of the palm are, in units of a clear fold: as the synthetic world draws them, halved by sRGB."""
+LINES_ON_PADS = 0.7
+"""How much of them stays on the palm's side of fingers: Gaussians of 1 mm draw lines as bars, darkest on painted skin
+that was straightened."""
 AROUND_PASSES = 20
 """Smoothings over the mesh that leave the skin around, some 10 mm: half of what a knuckle of 17 mm stands out stays."""
 NAIL_REACH = 1.0
@@ -76,18 +85,24 @@ def main(folder: Path) -> None:
     target = Path(__file__).parents[1] / "src/oasis_warp/assets/skin"
     hand = bundled_hand()
     faces, places = rasterize(texel_corners(hand), BOX[3], BOX[2])
-    for k, (name, gain) in enumerate(HANDS.items()):
+    details = []
+    for name, gain in HANDS.items():
         bgr = cv2.imread(str(folder / f"{name}.png"))
         if bgr is None:
             raise FileNotFoundError(f"{folder / name}.png: expected a picture; give the folder of the crops.")
         picture = bgr[..., ::-1] / 255
         detail = band_pass(hand, np.log(np.maximum(picture, DARKEST)), faces, places)
-        stored = np.rint(GREY + STEPS * LOUDEST * np.tanh(gain * detail / LOUDEST)).clip(0, 255).astype(np.uint8)
+        details.append(even_palm(hand, gain * detail, faces, places))
+    share = finger_pads(hand, faces, places)[..., None]
+    details[0] = details[0] + share * (details[1] - details[0])
+    for k, detail in enumerate(details):
+        stored = np.rint(GREY + STEPS * LOUDEST * np.tanh(detail / LOUDEST)).clip(0, 255).astype(np.uint8)
         write(target / f"detail_{k}.png", spread_out(stored, faces >= 0))
     folds = [lines_on_back(hand, number) for number in PEOPLE]
     palms = [lines_on_palm(hand, number) for number in PALMS]
     drawn = [fold["fold"] + palm for fold, palm in zip(folds, palms, strict=True)]
     lines = 255 * resampled(torch.stack([*drawn, folds[0]["vein"]], 1) / LOUDEST_LINE, faces, places)
+    lines *= 1 - (1 - LINES_ON_PADS) * share
     write(target / "lines.png", spread_out(np.rint(np.clip(lines, 0, 255)).astype(np.uint8), faces >= 0, fill=0))
     write(target / "nails.png", spread_out(nails(hand, faces, places), faces >= 0))
     write_relief(hand, target / "relief.npz")
@@ -166,6 +181,40 @@ def sharpened(detail: np.ndarray, on: np.ndarray) -> np.ndarray:
     fine = np.where(on[..., None], detail - coarse, 0)
     grey = fine.mean(2, keepdims=True)
     return np.where(on[..., None], coarse, 0) + FINE_GAIN * (grey * np.array(DARKER) + COLOUR * (fine - grey))
+
+
+def even_palm(hand: HandModel, detail: np.ndarray, faces: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """The detail of palms with the same contrast everywhere, and on fingers only what is fine.
+
+    In the pictures, creases are dark bars, the widest of pigment on dark skin, and the paint that fills the sides of
+    fingers frames them: on straightened fingers, rings and frames as of nails. Divided by its contrast around,
+    all of a palm is skin; creases are drawn (`lines_on_palm`).
+    """
+    on = faces >= 0
+    palm, pads = on_texels(label_regions(hand).palm, hand, faces, places), finger_pads(hand, faces, places)
+
+    def around(values: np.ndarray, reach: float) -> np.ndarray:
+        weight = cv2.GaussianBlur(on.astype(np.float64), (0, 0), reach)
+        return cv2.GaussianBlur(values * on[..., None], (0, 0), reach) / np.maximum(weight, 1e-6)[..., None]
+
+    fine = around(detail - pads[..., None] * around(detail, ON_PALM_FINGERS), SOFT)
+    for _ in range(EVENINGS):
+        contrast = np.sqrt(around(np.square(fine), EVEN_REACH).mean(2, keepdims=True))
+        fine = PALM_CONTRAST * fine / np.hypot(contrast, FLAT)
+        fine = PALM_LOUDEST * np.tanh(fine / PALM_LOUDEST)
+    return np.where(on[..., None], detail + palm[..., None] * (fine - detail), 0)
+
+
+def finger_pads(hand: HandModel, faces: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Share of the palm's side of fingers in each texel, [H, W]."""
+    finger = on_texels((hand.segment > 0).double(), hand, faces, places)
+    return cv2.GaussianBlur(finger, (0, 0), ON_PALM_FINGERS) * on_texels(label_regions(hand).palm, hand, faces, places)
+
+
+def on_texels(values: torch.Tensor, hand: HandModel, faces: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Values at the vertices, read at the texels, [H, W]; 0 beside the hand."""
+    corners = hand.faces.numpy()[np.maximum(faces, 0)]
+    return np.where(faces >= 0, (values.double().numpy()[corners] * places).sum(2), 0)
 
 
 def light_around_bones(hand: HandModel, colors: np.ndarray) -> np.ndarray:

@@ -123,6 +123,17 @@ def test_weak_shade_in_doubt_goes_when_the_sky_changes_nearby(hand):
         assert float(stays[here, 0]) == 0 and float(stays[here, 1]) == left
 
 
+def test_shade_in_doubt_goes_with_a_small_change_of_the_sky(hand):
+    """The outline of a finger tip stayed on the palm when the finger was only half straightened."""
+    n_vertices = len(hand.template)
+    facing = torch.tensor([[0.0, 0.0, 1.0]]).expand(n_vertices, 3)
+    on, light = Lighting(facing, torch.ones(n_vertices, 4)), EVEN._replace(facing=facing)
+    for change, doubt, left in ((0.0, 1.0, 1.0), (0.08, 0.0, 1.0), (0.08, 1.0, 0.0)):
+        in_doubt = light._replace(doubt=torch.full((n_vertices,), doubt))
+        stays = remaining_shade(in_doubt, on, torch.full((n_vertices,), 1 - change))
+        torch.testing.assert_close(stays, torch.full_like(stays, left), atol=1e-4, rtol=0)
+
+
 def test_colours_and_shade_come_to_what_is_shown():
     shown = torch.tensor([[0.9, 0.5, 0.0], [1.0, 1.0, 0.2]])
     shade = torch.tensor([[0.5, 0.5, 0.5], [2.0, 0.5, 1.0]])

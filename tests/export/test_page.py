@@ -158,6 +158,8 @@ def test_an_avatar_without_light_of_its_own_begins_in_even_light(right_hand):
         ("shading.js", "GAMMA", pose.GAMMA),
         ("shading.js", "SAME_SKY", pose.SAME_SKY),
         ("shading.js", "OTHER_SKY", pose.OTHER_SKY),
+        ("shading.js", "SAME_BESIDE", pose.SAME_BESIDE),
+        ("shading.js", "OTHER_BESIDE", pose.OTHER_BESIDE),
         ("shading.js", "WEAK", pose.WEAK),
         ("shading.js", "DEEP", pose.DEEP),
         ("sky.js", "BUFFER", sky_exposure.SIZE),

@@ -10,8 +10,9 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d
+from torch.nn.functional import avg_pool2d
 
+from oasis_warp.adaptation.scraps import largest, scrap_share
 from oasis_warp.avatar.anchors import PRIOR_SIZE
 from oasis_warp.avatar.observation import Observation, inner_mask, observe, sample
 from oasis_warp.core.camera import project
@@ -60,7 +61,9 @@ def mask_unreliable(hand: HandModel, drawn: Float[Tensor, "S S 3"], crop: HandCr
     vertices, faces = crop.posed.vertices, hand.faces.to(crop.posed.vertices.device)
     seen = depth_map(vertices, faces, camera.viewmat, camera.K, camera.width, camera.height, validate=False)
     behind, elsewhere = _behind_outline(hand, seen), _other_places(hand, seen, crop.reading)
-    return crop._replace(mask=crop.mask * (1 - _background_share(drawn, crop)) * ~behind * (1 - elsewhere))
+    scraps = scrap_share(hand, drawn, crop, seen)
+    trusted = (1 - _background_share(drawn, crop)) * ~behind * (1 - elsewhere) * (1 - scraps)
+    return crop._replace(mask=crop.mask * trusted)
 
 
 def _background_share(drawn: Float[Tensor, "S S 3"], crop: HandCrop) -> Float[Tensor, "S S"]:
@@ -115,10 +118,7 @@ def _other_places(
 
 def _largest(values: Float[Tensor, "S S"], reach: float) -> Float[Tensor, "S S"]:
     """The largest value around each pixel, up to `reach` times the picture's side along both axes."""
-    pixels, planes = round(reach * len(values)), values[None, None]
-    for size in ((1, 2 * pixels + 1), (2 * pixels + 1, 1)):  # rows, then columns: the same maximum
-        planes = max_pool2d(planes, size, stride=1, padding=(size[0] // 2, size[1] // 2))
-    return planes[0, 0]
+    return largest(values, round(reach * len(values)))
 
 
 SHARPNESS = 2.0

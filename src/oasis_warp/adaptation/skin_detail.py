@@ -29,9 +29,6 @@ BOX, BODY = (732, 1621, 411, 412), 2048
 """Column, row, width and height of the maps in the texture of the whole body, and that one's side [px]."""
 LOW, SPAN = (0.361408, 0.011539), 0.192729
 """Corner and side of the hand's texture coordinates in those of the body."""
-GAINS_ON_PALM = 1.0, 1.0, 0.6
-"""Gain of each hand's detail on palms. The third one is dark skin, in whose creases pigment lies: on fingers that
-showed this hand they were dark bars. With these gains the fingers of all three have the same contrast."""
 MIX_PASSES, MIX_SHARPNESS = 60, 3.0
 """Smoothings of the noise that chooses between the hands, about 20 mm, and its strength: most places show one hand,
 since the mean of several is blurred."""
@@ -70,8 +67,7 @@ def sample_detail(hand: HandModel, gaussians: CanonicalGaussians | Places, seed:
     faces = hand.faces.cpu().contiguous()
     noise = _smooth_noise(faces.numpy().tobytes(), faces.dtype, len(hand.template), seed)
     weights = torch.softmax(MIX_SHARPNESS * noise[:, :HANDS], 1)
-    gains = torch.lerp(torch.ones(HANDS), torch.tensor(GAINS_ON_PALM), label_regions(hand).palm.cpu()[:, None])
-    of_vertices = torch.cat([weights, WARP * noise[:, HANDS:], gains], 1).to(device)
+    of_vertices = torch.cat([weights, WARP * noise[:, HANDS:]], 1).to(device)
     first = _first_corner(hand.faces, len(hand.template)).to(device)
     faces, uv = hand.faces.to(device), _texels(hand).to(device)
     uv_faces = hand.uv_faces.to(device)
@@ -80,14 +76,14 @@ def sample_detail(hand: HandModel, gaussians: CanonicalGaussians | Places, seed:
     at_corners = torch.cat([uv[uv_faces[gaussians.face_index]], of_vertices[faces[gaussians.face_index]]], -1)
     on_faces = (at_corners * gaussians.barycentrics[..., None]).sum(1)
     read = torch.cat([on_points, on_faces])
-    place, share, shift, gains = read.split([2, HANDS, 2, HANDS], 1)
+    place, share, shift = read.split([2, HANDS, 2], 1)
     share = share.square() / share.square().sum(1, keepdim=True)
     maps = _maps().to(device)
     moved = _sample(maps[: 3 * HANDS], place + shift).unflatten(1, (HANDS, 3))
     own = _sample(maps[3 * HANDS :], place)  # not moved: lines and nails belong to their joints
     plate, bare = own[:, 3], 1 - own[:, 3:4]
     fold = torch.lerp(own[:, 0], own[:, 1], share[:, 0])
-    skin = (moved * (share * gains)[..., None]).sum(1)
+    skin = (moved * share[..., None]).sum(1)
     return SkinDetail(skin * bare, fold * bare[:, 0], own[:, 2], plate, own[:, 4], own[:, 5])
 
 

@@ -53,13 +53,13 @@ PARTS = 2
 """An edge, of faces that are cut for the painting."""
 SHOWS_FORM = 0.3
 """Cosine between normal and view from which a photo shows the forms of skin that it shows on a slant."""
-ON_PALM, ON_BACK = 2.7, 1.25
+ON_PALM, ON_BACK = 2.65, 1.25
 """Gain of the maps' detail on palms and on backs."""
-LOUDEST = 0.12
-"""Logarithm of sRGB that this detail tends to: the creases of some fingers in the maps were dark bars."""
+LOUDEST_ON_PALM, LOUDEST_ON_BACK = 0.2, 0.12
+"""Logarithms of sRGB that this detail tends to. The maps have the same contrast all over palms, not over backs."""
 LINES_ON_PALM = 1.5
-"""Gain of the drawn lines of palms. With these gains palms that 13 photos of same_hand hide have .66/.66/.66/.70 of
-real hands' contrast; with gains of 1.9 and 1.1 and no limit .69/.68/.65/.70, and bars."""
+"""Gain of the drawn lines of palms. With these gains palms that ten photos of same_hand hide have .67/.62/.64/.72 of
+real hands' contrast; with maps that were not even .65/.64/.65/.70, and dark rings and frames on fingers."""
 FOLD, VEIN = (-0.10, -0.14, -0.15), (-0.07, -0.04, -0.04)
 """What a fold and a vein add to the logarithms of the colours."""
 USUAL_CONTRASTS = 0.023, 0.016
@@ -322,7 +322,8 @@ def _skin_detail(detail: SkinDetail, palm: Float[Tensor, "N 1"] | float) -> Floa
     folds = (1 + (LINES_ON_PALM - 1) * palm) * detail.fold[:, None]
     lines = folds * detail.skin.new_tensor(FOLD) + detail.vein[:, None] * detail.skin.new_tensor(VEIN)
     own = (ON_BACK + (ON_PALM - ON_BACK) * palm) * detail.skin
-    return LOUDEST * torch.tanh(own / LOUDEST) + lines
+    loudest = LOUDEST_ON_BACK + (LOUDEST_ON_PALM - LOUDEST_ON_BACK) * palm
+    return loudest * torch.tanh(own / loudest) + lines
 
 
 def _clarities(hand: HandModel, observations: VertexObservations) -> tuple[float, float]:

@@ -23,6 +23,9 @@ SAME_SKY, OTHER_SKY = 0.08, 0.25
 """How much more of the sky skin sees than in the photo, up to which its shade stays and from which it is gone: what
 cast it has moved. Where it sees less, nothing that was there has gone, and palm lines stay in a fist. Buffers of 3 mm
 err by .05; a finger that lies on the palm hides .5 and more."""
+SAME_BESIDE, OTHER_BESIDE = 0.02, 0.08
+"""The same where the photo may show another part of the hand: what it showed there goes as soon as that part moves.
+Set by eye on the print of a finger tip, half straightened, in one photo of tests/data/photos/same_hand."""
 WEAK, DEEP = 0.3, 0.6
 """Differences of shade from 1 up to which it is relief or tone of the skin itself, and from which it is a sharp shadow,
 gloss, or another part of the hand. Set by eye on one thumb-up photo with gashes, creases and a red spot."""
@@ -137,9 +140,10 @@ def remaining_shade(light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | N
         return torch.cat([stays, stays], -1)
     change = (on.exposure[..., 0] - seen).clamp_min(0)
     nearby = largest_nearby(change)
-    own = change if light.doubt is None else torch.lerp(change, nearby, light.doubt)
-    change = torch.stack([nearby, own], -1)
-    return stays * ((OTHER_SKY - change) / (OTHER_SKY - SAME_SKY)).clamp(0, 1)
+    doubt = torch.zeros_like(change) if light.doubt is None else light.doubt
+    change = torch.stack([nearby, torch.lerp(change, nearby, doubt)], -1)
+    same, other = SAME_SKY + (SAME_BESIDE - SAME_SKY) * doubt, OTHER_SKY + (OTHER_BESIDE - OTHER_SKY) * doubt
+    return stays * ((other[..., None] - change) / (other - same)[..., None]).clamp(0, 1)
 
 
 def shading_factors(

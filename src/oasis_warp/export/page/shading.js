@@ -5,6 +5,7 @@
 const GAMMA = 2.2; // light is sRGB to this power, nearly
 const AS_IN_PHOTO = Math.cos((5 * Math.PI) / 180), TURNED_AWAY = Math.cos((20 * Math.PI) / 180);
 const SAME_SKY = 0.08, OTHER_SKY = 0.25; // changes of the share of the sky that skin sees, as in avatar/pose.py
+const SAME_BESIDE = 0.02, OTHER_BESIDE = 0.08; // the same where the photo is in doubt
 const THROUGH_SKIN = [0.15, 0.07, 0.04]; // light that reaches skin which sees no sky, as in avatar/sky.py
 const WEAK = 0.3, DEEP = 0.6; // differences of shade from 1, up to which it is the skin's own, and from which it is not
 const MAP_SEEN = [0.36, 0.6, 0.57], MAP_INVENTED = [0.89, 0.55, 0.28], MAP_SKIN = 0.35; // colours of the map; share of skin in it
@@ -41,11 +42,13 @@ function lightVertices(body, shading, light, hurry = false) {
   for (let v = 0; v < body.nVertices; v++) {
     const x = normals[3 * v], y = normals[3 * v + 1], z = normals[3 * v + 2];
     const kept = facing ? between(x * facing[3 * v] + y * facing[3 * v + 1] + z * facing[3 * v + 2], TURNED_AWAY, AS_IN_PHOTO) : 0;
-    const left = (moved) => (albedo && seen ? kept * (1 - between(moved, SAME_SKY, OTHER_SKY)) : kept);
+    const unsure = doubt ? doubt[v] : 0, mixed = (sure, beside) => sure + unsure * (beside - sure);
+    const same = mixed(SAME_SKY, SAME_BESIDE), other = mixed(OTHER_SKY, OTHER_BESIDE);
+    const left = (moved) => (albedo && seen ? kept * (1 - between(moved, same, other)) : kept);
     deep[v] = left(nearby[v]);
     lightPlace(light, bounce, x, y, z, sky.exposure, 4 * v, factors, 4 * v);
     if (shade) for (let c = 0; c < 3; c++) factors[4 * v + c] *= 1 + deep[v] * (shade[3 * v + c] - 1);
-    factors[4 * v + 3] = left(doubt ? change[v] + doubt[v] * (nearby[v] - change[v]) : change[v]);
+    factors[4 * v + 3] = left(mixed(change[v], nearby[v]));
   }
   ends.forEach(({ vertex, normal }, k) => {
     const [x, y, z] = turned(rotationMatrix(body.quats, 4 * vertex), normal);
