@@ -60,6 +60,8 @@ SOFT, ON_PALM_FINGERS, EVEN_REACH = 0.6, 3.0, 9.0
 PALM_CONTRAST, FLAT, PALM_LOUDEST, EVENINGS = 0.04, 0.012, 0.08, 2
 """Root mean square of the logarithms of a palm's detail, contrast below which skin is left smoother, and what this
 detail tends to; how often it is divided by its contrast and limited. Set by eye, as the blurs, on drawn hands."""
+ON_PADS = 0.7
+"""Contrast of the palm's side of fingers over that of palms, by eye: with 1 fingers look mottled."""
 RIM = 3.0
 """Width of the islands' rims over which detail fades in: what lies beside them bled into them [texels]."""
 GREY, STEPS = 128, 400
@@ -202,6 +204,7 @@ def even_palm(hand: HandModel, detail: np.ndarray, faces: np.ndarray, places: np
         contrast = np.sqrt(around(np.square(fine), EVEN_REACH).mean(2, keepdims=True))
         fine = PALM_CONTRAST * fine / np.hypot(contrast, FLAT)
         fine = PALM_LOUDEST * np.tanh(fine / PALM_LOUDEST)
+    fine *= 1 - (1 - ON_PADS) * pads[..., None]
     return np.where(on[..., None], detail + palm[..., None] * (fine - detail), 0)
 
 
