@@ -157,7 +157,7 @@ def test_shade_stays_as_long_as_skin_faces_as_in_the_photo(hand, scene, of):
 
     torch.testing.assert_close(ratio(0), torch.full_like(truth.colors, 0.9))
     half = ratio(12)
-    assert bool((half > 0.9 - 1e-3).all()) and bool((half < 1 + 1e-3).all()) and float(half.std()) > 0.01
+    assert bool((half > 0.9 - 1e-3).all()) and bool((half < 1 + 1e-3).all()) and float(half.std()) > 0.005  # gradual
     rotated = turn(pose, 180)
     away = (shaded.pose(rotated).colors / plain.pose(rotated).colors)[: len(truth.vertex_index)]
     around = light.facing[truth.vertex_index, 0].abs() < 0.7  # others turn by less

@@ -110,6 +110,17 @@ def test_deep_shade_beside_a_finger_that_lay_there_goes_with_it_and_weak_shade_s
     torch.testing.assert_close(left[1][at], torch.full_like(left[1][at], 0.9))
 
 
+def test_deep_shade_ends_with_the_pose_of_the_photo_on_all_of_the_hand(hand):
+    """A palm kept the light of the photo and the fingers, which turned, did not: two tones."""
+    n_vertices = len(hand.template)
+    facing = torch.tensor([[0.0, 0.0, 1.0]]).expand(n_vertices, 3)
+    for share, left in ((0.0, 1.0), (0.3, 0.5), (0.6, 0.0)):
+        normals = facing.clone()
+        normals[: round(share * n_vertices)] = torch.tensor([1.0, 0.0, 0.0])
+        stays = remaining_shade(EVEN._replace(facing=facing), Lighting(normals, None), None)
+        assert float(stays[-1, 0]) == pytest.approx(left, abs=0.01) and float(stays[-1, 1]) == 1
+
+
 def test_weak_shade_in_doubt_goes_when_the_sky_changes_nearby(hand):
     """A finger's print on the palm has the palm's colour, nearly; beside its outline the sky hardly changes."""
     n_vertices, sky = len(hand.template), sky_mesh(torch.device("cpu"))

@@ -156,6 +156,8 @@ def test_an_avatar_without_light_of_its_own_begins_in_even_light(right_hand):
     ("file", "name", "value"),
     [
         ("shading.js", "GAMMA", pose.GAMMA),
+        ("shading.js", "SAME_POSE", pose.SAME_POSE),
+        ("shading.js", "OTHER_POSE", pose.OTHER_POSE),
         ("shading.js", "SAME_SKY", pose.SAME_SKY),
         ("shading.js", "OTHER_SKY", pose.OTHER_SKY),
         ("shading.js", "SAME_BESIDE", pose.SAME_BESIDE),

@@ -4,6 +4,7 @@
 
 const GAMMA = 2.2; // light is sRGB to this power, nearly
 const AS_IN_PHOTO = Math.cos((5 * Math.PI) / 180), TURNED_AWAY = Math.cos((20 * Math.PI) / 180);
+const SAME_POSE = 0.9, OTHER_POSE = 0.5; // shares of the hand that face as in the photo
 const SAME_SKY = 0.08, OTHER_SKY = 0.25; // changes of the share of the sky that skin sees, as in avatar/pose.py
 const SAME_BESIDE = 0.02, OTHER_BESIDE = 0.08; // the same where the photo is in doubt
 const THROUGH_SKIN = [0.15, 0.07, 0.04]; // light that reaches skin which sees no sky, as in avatar/sky.py
@@ -31,6 +32,7 @@ const between = (x, low, high) => Math.min(Math.max((x - low) / (high - low), 0)
 
 // Factors of the colours of every vertex and the share of the photo's weak shade that is left, into shading.factors; that
 // of deep shade into shading.deep: for it, and where the photo is in doubt, the change of the sky is the largest nearby.
+// Deep shade also ends with the photo's pose, on all of the hand at once.
 function lightVertices(body, shading, light, hurry = false) {
   const { shade, facing, doubt } = body.data.arrays, { normals, factors, sky, change, nearby, deep, ends } = shading, { harmonics, albedo, seen } = light;
   if (albedo) exposeVertices(body, sky, normals, harmonics, hurry);
@@ -39,13 +41,20 @@ function lightVertices(body, shading, light, hurry = false) {
     largestNearby(body, sky, change, nearby);
   }
   const bounce = albedo && albedo.map((a) => [2.0404 * a - 0.3324, -4.7951 * a + 0.6417, 2.7552 * a + 0.6903]);
+  const keptAt = (v) => {
+    const a = 3 * v;
+    if (!facing) return 0;
+    return between(normals[a] * facing[a] + normals[a + 1] * facing[a + 1] + normals[a + 2] * facing[a + 2], TURNED_AWAY, AS_IN_PHOTO);
+  };
+  let held = 0;
+  for (let v = 0; v < body.nVertices; v++) held += keptAt(v) / body.nVertices;
+  held = between(held, OTHER_POSE, SAME_POSE);
   for (let v = 0; v < body.nVertices; v++) {
-    const x = normals[3 * v], y = normals[3 * v + 1], z = normals[3 * v + 2];
-    const kept = facing ? between(x * facing[3 * v] + y * facing[3 * v + 1] + z * facing[3 * v + 2], TURNED_AWAY, AS_IN_PHOTO) : 0;
+    const x = normals[3 * v], y = normals[3 * v + 1], z = normals[3 * v + 2], kept = keptAt(v);
     const unsure = doubt ? doubt[v] : 0, mixed = (sure, beside) => sure + unsure * (beside - sure);
     const same = mixed(SAME_SKY, SAME_BESIDE), other = mixed(OTHER_SKY, OTHER_BESIDE);
     const left = (moved) => (albedo && seen ? kept * (1 - between(moved, same, other)) : kept);
-    deep[v] = left(nearby[v]);
+    deep[v] = held * left(nearby[v]);
     lightPlace(light, bounce, x, y, z, sky.exposure, 4 * v, factors, 4 * v);
     if (shade) for (let c = 0; c < 3; c++) factors[4 * v + c] *= 1 + deep[v] * (shade[3 * v + c] - 1);
     factors[4 * v + 3] = left(mixed(change[v], nearby[v]));

@@ -1,0 +1,91 @@
+import pytest
+import torch
+from synthetic import avatar_of, crop_of
+
+from oasis_warp.adaptation.smooth_shade import spread_shade
+from oasis_warp.avatar.anchors import vertex_to_gaussians
+from oasis_warp.avatar.appearance import label_regions, region_colors
+from oasis_warp.avatar.observation import observe
+from oasis_warp.avatar.pose import posed_lighting
+from oasis_warp.core.types import HandLight
+from oasis_warp.hand.poses import named_pose
+
+
+@pytest.fixture(scope="module")
+def scene(hand):
+    """Crop in even light, its Gaussians, its pose, a light without shade, and what the crop shows."""
+    crop, truth, pose = crop_of(hand, 0.6 * region_colors(label_regions(hand), 0.03))
+    even = torch.zeros(4, 3)
+    even[0] = 1
+    light = HandLight(even, torch.tensor([[0.3], [1.3]]).expand(2, 3), even[0], albedo=torch.tensor([0.4, 0.3, 0.25]))
+    facing = posed_lighting(crop.rest.vertices, crop.posed.vertices, hand.faces, light).normals
+    return crop, truth, pose, light._replace(shade=torch.ones_like(facing), facing=facing), observe(hand, crop)
+
+
+def shown_in(seen):
+    return (seen.visibility > 0.5) & (seen.facing > 0)
+
+
+def shaded(hand, truth, log_shade):
+    return truth._replace(shade=vertex_to_gaussians(log_shade, hand.faces, truth).exp())
+
+
+@pytest.mark.parametrize("shade", [(-0.2, -0.2, -0.2), (0.2, 0.15, 0.1)])
+def test_smooth_shade_goes_on_behind_the_rim(hand, scene, shade):
+    """From the side there was an edge where the photo's pale skin met painted skin."""
+    crop, truth, _, light, seen = scene
+    shown, wanted = shown_in(seen), torch.tensor(shade)
+    gaussians = shaded(hand, truth, torch.where(shown[:, None], wanted, 0.0))
+    _, spread = spread_shade(hand, gaussians, crop, light)
+    assert spread.shade is not None
+    distance = torch.cdist(crop.rest.vertices, crop.rest.vertices[seen.confidence > 0.1]).amin(1)
+    near, far = ~shown & (distance > 0.004) & (distance < 0.006), ~shown & (distance > 0.02)
+    torch.testing.assert_close(spread.shade[near].log().median(0).values, 0.8 * wanted, atol=0.05, rtol=0)
+    assert float(spread.shade[far].log().abs().median()) < 0.6 * float(wanted.abs().max())
+
+
+def test_no_impossible_hue_goes_on_behind_the_rim(hand, scene):
+    """Yellow floor beside an outline would dye the back."""
+    crop, truth, _, light, seen = scene
+    floor = torch.where(shown_in(seen)[:, None], torch.tensor([0.6, 0.3, -0.9]), 0.0)
+    _, spread = spread_shade(hand, shaded(hand, truth, floor), crop, light)
+    assert spread.shade is not None
+    logs = spread.shade[seen.facing < -0.3].log()
+    assert float((logs - logs.mean(1, keepdim=True)).abs().max()) < 0.15 and float(logs.max()) < 0.41
+
+
+def test_the_photo_view_stays_and_fine_shade_with_the_gaussians(hand, scene):
+    crop, truth, pose, light, seen = scene
+    relief = 0.05 * torch.randn(len(hand.template), 1, generator=torch.Generator().manual_seed(0))
+    log_shade = torch.where(shown_in(seen)[:, None], 0.25 * torch.sin(90 * hand.template[:, :1]) + relief, 0.0)
+    before = shaded(hand, truth, log_shade.expand(-1, 3))
+    after, spread = spread_shade(hand, before, crop, light)
+    drawn = [
+        avatar_of(hand, g, pose, crop.camera, own).render(crop.camera, pose).image
+        for g, own in ((before, light), (after, spread))
+    ]
+    assert float((drawn[1] - drawn[0]).abs().quantile(0.99)) < 2 / 255
+    sure = (seen.confidence > 0.9)[truth.vertex_index]
+    assert after.shade is not None
+    left, fine = after.shade[: len(sure)][sure].log()[:, 0], relief[truth.vertex_index][sure][:, 0]
+    assert float(torch.corrcoef(torch.stack([left, fine]))[0, 1]) > 0.8 and float(left.std()) < 0.08
+
+
+def test_in_another_pose_no_part_of_the_hand_keeps_smooth_shade(hand, scene):
+    """A palm kept its shade beside fingers that lost it as they turned: two tones with an edge."""
+    crop, truth, pose, light, _ = scene
+    log_shade = torch.full_like(hand.template, -0.25)
+    after, spread = spread_shade(hand, shaded(hand, truth, log_shade), crop, light)
+    fist = pose._replace(angles=named_pose(hand, "fist"))
+    dark, plain = (
+        avatar_of(hand, g, pose, crop.camera, own).pose(fist).colors
+        for g, own in ((after, spread), (truth, light))
+    )
+    ratio = (dark / plain).log()[: len(truth.vertex_index)]
+    palm = ((label_regions(hand).palm > 0.9) & (hand.segment == 0))[truth.vertex_index]
+    assert float(ratio[palm].median()) > -0.05
+
+
+def test_without_shade_there_is_none_to_spread(hand, scene):
+    crop, truth, _, light, _ = scene
+    assert spread_shade(hand, truth._replace(shade=None), crop, light)[1] is light
