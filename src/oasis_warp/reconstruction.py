@@ -291,7 +291,7 @@ def _finish(
     gaussians, invented, first = adaptation.gaussians, None, crops[0]
     if config.unseen == "painted":
         with stage("painting"):
-            painted = paint_unseen(hand, gaussians, adaptation.guess, first, adaptation.observations, seed=config.seed)
+            painted = paint_unseen(hand, gaussians, adaptation.guess, first, adaptation.trusted, seed=config.seed)
             gaussians, invented = painted.gaussians, painted.invented
     rest, lights = first.rest.vertices, adaptation.lights
     if lights is not None:

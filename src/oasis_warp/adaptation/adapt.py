@@ -64,6 +64,13 @@ class Adaptation(NamedTuple):
     """What to add to each photo after that, so that photos agree where they show the same place; 0 for one photo."""
     lights: tuple[HandLight, ...] | None
     """In which the Gaussians, times gains, look like the photos; None where light is in the colours, or left out."""
+    trust: Float[Tensor, "K V"]
+    """How far what each photo shows beyond the guess is skin (`trust_in_albedo`); 1 where the light is kept."""
+
+    @property
+    def trusted(self) -> VertexObservations:
+        """The observations, of which only what is skin counts."""
+        return self.observations._replace(confidence=self.observations.confidence * self.trust)
 
     @property
     def light(self) -> HandLight | None:
@@ -136,7 +143,10 @@ def adapt(
         progress("completion", 0, 1)
         gaussians, shading = _complete(hand, photos, calibrated, evenly_exposed, config)
         progress("completion", 1, 1)
-    result = Adaptation(gaussians, guess, calibration, (), photos.observations, photos.gains, shading, photos.lights)
+    result = Adaptation(
+        gaussians, guess, calibration, (), photos.observations, photos.gains, shading, photos.lights,
+        photos.trust,
+    )  # fmt: skip
     if config.light == "even" and photos.lights:  # all that is left to learn is light
         return result._replace(gaussians=in_even_light(gaussians, photos.lights[0]), lights=None)
     targets = _texture_targets(hand, photos, gaussians, shading, config)._replace(perceptual=perceptual)

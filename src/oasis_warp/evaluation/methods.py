@@ -130,6 +130,5 @@ def reconstructions(
             if ONE_SHOT in stages:
                 yield Method(name, ONE_SHOT), LitGaussians(adapted.gaussians, adapted.light)
             if PAINTED in stages:
-                shown = adapted.observations
-                painted = paint_unseen(hand, adapted.gaussians, adapted.guess, crop, shown, seed=config.seed)
+                painted = paint_unseen(hand, adapted.gaussians, adapted.guess, crop, adapted.trusted, seed=config.seed)
                 yield Method(name, PAINTED), LitGaussians(painted.gaussians, adapted.light)
