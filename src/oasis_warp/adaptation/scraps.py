@@ -15,9 +15,9 @@ from oasis_warp.ops import DepthMap
 JUMP = 0.008
 """Distance on the hand at rest between neighbouring pixels that makes an outline inside the hand, also where a finger
 touches what lies behind it [m]."""
-REACH, AROUND = 0.005, 0.016
-"""How far from an outline scraps may lie, and side of the square, averaged over twice, that they are compared with
-[m]."""
+REACH, SHADOW_REACH, AROUND = 0.005, 0.01, 0.016
+"""How far from an outline scraps may lie, and shadows of a part of the hand from its outline, and side of the square,
+averaged over twice, that they are compared with [m]."""
 DARKER, OTHER_HUE = (3.0, 4.5), (3.0, 5.0)
 """Differences from the skin around, in robust standard deviations of the rest of this hand, from which a pixel counts
 less and from which it does not count. Set by eye on ten photos of tests/data/photos/same_hand, with the lengths; with
@@ -53,7 +53,10 @@ def scrap_share(hand: HandModel, drawn: Float[Tensor, "S S 3"], crop: HandCrop, 
     on, (place, nail) = seen.face_ids >= 0, _read(hand, seen)
     outlines = _outlines(on, place)
     scale = float(crop.camera.K[0, 0] / seen.depth[on].median()) if bool(on.any()) else 0.0  # pixels of a metre
-    inside, around = (largest(where.to(drawn), round(REACH * scale)) for where in outlines)
+    shaded, inside, around = (
+        largest(where.to(drawn), round(reach * scale))
+        for where, reach in ((outlines.inside, SHADOW_REACH), (outlines.inside, REACH), (outlines.around, REACH))
+    )
     beside = torch.maximum(inside, around)
     rest = crop.mask * on * (1 - beside)
     if float(rest.sum()) < FEWEST:
@@ -66,7 +69,7 @@ def scrap_share(hand: HandModel, drawn: Float[Tensor, "S S 3"], crop: HandCrop, 
     usual, usual_hue = (1.48 * values[sure].median() for values in (grey.abs(), hue))
     dark = _between(-grey / usual.clamp_min(LEAST_DARK), *DARKER)
     other = _between(hue / usual_hue.clamp_min(LEAST_HUE), *OTHER_HUE)
-    return torch.maximum(inside * dark, beside * (1 - nail) * other) * on
+    return torch.maximum(shaded * dark, beside * (1 - nail) * other) * on
 
 
 def largest(values: Float[Tensor, "S S"], pixels: int) -> Float[Tensor, "S S"]:
