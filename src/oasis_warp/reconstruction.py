@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.adaptation.adapt import Adaptation, adapt, add_detail
-from oasis_warp.adaptation.rim_shade import continue_shade, limit_shade, match_rim
+from oasis_warp.adaptation.rim_shade import limit_shade, match_rim
 from oasis_warp.adaptation.smooth_shade import spread_shade
 from oasis_warp.adaptation.unseen_skin import paint_unseen
 from oasis_warp.avatar.densify import coarsen
@@ -297,8 +297,7 @@ def _finish(
     if lights is not None:
         gaussians = limit_shade(hand, gaussians, crops, lights[0])
         gaussians, spread = spread_shade(hand, gaussians, first, lights[0])
-        behind = continue_shade(hand, gaussians, first, spread)
-        lights = (match_rim(hand, gaussians, first, behind), *lights[1:])
+        lights = (match_rim(hand, gaussians, first, spread), *lights[1:])
         lights = tuple(end_shade(hand, light, rest) for light in lights)
     return adaptation._replace(gaussians=close_wrist(hand, gaussians, rest), lights=lights), invented
 

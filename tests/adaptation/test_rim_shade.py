@@ -2,7 +2,7 @@ import pytest
 import torch
 from synthetic import crop_of
 
-from oasis_warp.adaptation.rim_shade import continue_shade, limit_shade, match_rim
+from oasis_warp.adaptation.rim_shade import limit_shade, match_rim
 from oasis_warp.avatar.anchors import vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.observation import observe
@@ -28,27 +28,6 @@ def test_on_a_slant_shade_is_what_light_does_to_skin(hand, scene):
     slanted, openly = cosine.abs() < 0.2, cosine > 0.9
     assert float(limited[slanted].log().std(1).median()) < 0.12 < 0.7 < float(floor.shade[0].log().std())
     torch.testing.assert_close(limited[openly], floor.shade[openly])
-
-
-@pytest.mark.parametrize(("shade", "behind"), [(0.7, 0.85), (1.3, 1.0)])
-def test_dark_shade_goes_on_behind_the_rim_and_bright_shade_does_not(hand, scene, shade, behind):
-    """The shaded edge of a hand was a dark stripe before bright skin, seen from the side."""
-    crop, truth, light = scene
-    seen = observe(hand, crop)
-    own = torch.where((seen.confidence > 0)[:, None], shade, 1.0).expand(-1, 3)
-    shaded = truth._replace(shade=vertex_to_gaussians(own, hand.faces, truth))
-    found = continue_shade(hand, shaded, crop, light._replace(shade=torch.ones_like(own))).shade
-    assert found is not None
-    known, hidden = seen.confidence > 0.1, seen.confidence <= 0
-    assert bool((found[known] == 1).all())
-    near = torch.cdist(crop.rest.vertices[hidden], crop.rest.vertices[known]).amin(1) < 0.006
-    assert float(found[hidden][near].quantile(0.25)) == pytest.approx(behind, abs=0.1)
-    assert float(found.min()) > min(shade, 1) - 0.01
-
-
-def test_without_shade_there_is_none_to_continue(hand, scene):
-    crop, truth, light = scene
-    assert continue_shade(hand, truth._replace(shade=None), crop, light) is light
 
 
 def test_skin_just_behind_the_rim_is_drawn_in_the_colours_of_the_rim(hand, scene):

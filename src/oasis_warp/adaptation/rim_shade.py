@@ -1,4 +1,4 @@
-"""Shade at the rim of what photos show: kept to what light does to skin, and continued behind the rim."""
+"""Shade at the rim of what photos show: kept to what light does to skin, and just behind the rim as at the rim."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,6 @@ from oasis_warp.adaptation.sh_lighting import MIN_CONFIDENCE
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.observation import observe
 from oasis_warp.avatar.pose import MIN_COLOR, posed_lighting, shading
-from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandLight
 
@@ -54,42 +53,8 @@ def _likely(log_shade: Float[Tensor, "N 3"], least: float, most: float) -> Float
     return grey.clamp(least, most) + (log_shade - grey).clamp(-LIKELY_HUE, LIKELY_HUE)
 
 
-RIM_FACING, RIM_CONFIDENCE = 0.6, 0.2
-"""Cosine between normal and view below which skin is the rim of what a photo shows, and least confidence there."""
-RIM_DETAIL, BEHIND_REACH = 0.002, 0.04
-"""Length below which the rim's shade is averaged, and distance over which it is forgotten behind it [m]."""
 MAX_BEHIND = 0.5
-"""Largest logarithm of shade that is continued."""
-BEHIND_PASSES = 2
-"""Smoothings over the mesh of the border to what the photo shows."""
-
-
-def continue_shade(hand: HandModel, gaussians: CanonicalGaussians, crop: HandCrop, light: HandLight) -> HandLight:
-    """Continue dark shade from the rim of what the photo shows to the skin behind it.
-
-    Four harmonics miss how fast the light falls off to the side that a lamp does not reach. What they miss is shade,
-    which ended where the photo does: from the side it was a dark stripe before bright skin. The constants were set on
-    photos of tests/data/photos/same_hand.
-
-    Args:
-        hand: Model of the surface.
-        gaussians: Adapted to the photos.
-        crop: The first photo.
-        light: Its light.
-    """
-    if gaussians.shade is None or light.shade is None:
-        return light
-    rest, faces, seen = crop.rest.vertices, hand.faces.to(crop.image.device), observe(hand, crop)
-    own = vertex_colors(gaussians._replace(colors=gaussians.shade.log()), len(rest)) + light.shade.log()
-    grey = own.mean(-1, keepdim=True).clamp(-MAX_BEHIND, MAX_BEHIND)
-    rim = seen.confidence * ((seen.confidence > RIM_CONFIDENCE) & (seen.facing < RIM_FACING))
-    behind = inpaint(rest, faces, grey, rim, RIM_DETAIL, BEHIND_REACH)
-    hidden = (1 - seen.confidence / MIN_CONFIDENCE).clamp(0, 1)[:, None]
-    smooth = surface.smooth_over_mesh(hidden, surface.mesh_edges(faces), BEHIND_PASSES)
-    share = torch.minimum(smooth, hidden)
-    return light._replace(shade=torch.minimum(light.shade, torch.lerp(light.shade.log(), behind, share).exp()))
-
-
+"""Largest logarithm of shade behind the rim."""
 EDGE_DETAIL, JUST_BEHIND = 0.0005, 0.003
 """Length below which the rim's colours are averaged, and distance over which skin behind it gets as different from it
 as its own colour and light make it [m]: Gaussians of 1 mm show that far past what hides them."""
