@@ -55,6 +55,21 @@ def painted(hand, palm_photo):
     return paint(hand, palm_photo)
 
 
+def test_skin_that_is_seen_but_not_trusted_is_painted(hand, palm_photo):
+    """In the shadow of fingers all that a photo shows is shade: the opened palm had a smooth band there."""
+    crop, adapted = palm_photo
+    shaded = (crop.rest.vertices[:, 0] > crop.rest.vertices[:, 0].median()).float()
+    trusted = adapted._replace(trust=adapted.trust * (1 - shaded)).trusted
+    inner = (surface.smooth_over_mesh(shaded[:, None], surface.mesh_edges(hand.faces), 8)[:, 0] > 0.99) & (
+        adapted.observations.confidence[0] > 0.9
+    )
+    before, after = (paint(hand, palm_photo, observations=seen) for seen in (adapted.observations, trusted))
+    assert int(inner.sum()) > 500 and float(before.invented[inner].max()) == 0
+    assert float(after.invented[inner].min()) > 0.99
+    smooth, detailed = (detail_of(hand, vertex_colors(each.gaussians, len(inner)), inner) for each in (before, after))
+    assert detailed > 1.5 * smooth
+
+
 def unseen_back(hand, painted):
     regions = label_regions(hand)
     return (painted.invented > 0.99) & (regions.palm < 0.05) & (regions.nail < 0.05)

@@ -201,7 +201,7 @@ def paint_unseen(
         gaussians: Fitted to the photos, in even light.
         guess: Guess of the prior, before adaptation.
         crop: The first photo.
-        observations: What the photos show.
+        observations: What the photos show, as far as it is skin: `Adaptation.trusted`.
         seed: Seed of the detail.
     """
     rest = crop.rest.vertices
