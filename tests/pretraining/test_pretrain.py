@@ -14,6 +14,7 @@ import torch
 from painted_hands import PaintedHands
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
+from small_training import ALONE, CONFIG, small_network
 
 from oasis_warp.avatar.observation import source_photos
 from oasis_warp.core.errors import InputError
@@ -23,7 +24,6 @@ from oasis_warp.losses import masked_dssim, masked_l1
 from oasis_warp.network.config import COMPACT
 from oasis_warp.network.hand_network import HandNetwork, Prediction
 from oasis_warp.network.weights_file import load_network, trained_state
-from oasis_warp.pretraining.distributed import ProcessInfo
 from oasis_warp.pretraining.pretrain import CHECKPOINT, METRICS, SHEET, WEIGHTS, PretrainConfig, learning_rate, pretrain
 from oasis_warp.pretraining.prior_trainer import (
     LossConfig,
@@ -37,16 +37,6 @@ from oasis_warp.pretraining.prior_trainer import (
     true_pictures,
 )
 from oasis_warp.render import render
-
-ALONE = ProcessInfo(0, 1, torch.device("cpu"))
-SMALL = replace(COMPACT, image_size=32, width=16, heads=2, n_tokens=8, n_coarse=32, refine_layers=1, head_width=8)
-CONFIG = PretrainConfig(steps=4, warmup=2, precision="float32", checkpoint_every=2, log_every=1)
-
-
-def small_network(hand, **switches):
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        return HandNetwork(replace(SMALL, **switches), hand)
 
 
 @pytest.fixture(scope="module")

@@ -1,16 +1,13 @@
 """Training against a discriminator: what it judges, what it does not see, and that it stops and goes on."""
 
-from dataclasses import replace
 from itertools import islice
 
 import pytest
 import torch
 from painted_hands import PaintedHands
+from small_training import ALONE, CONFIG, small_network
 
-from oasis_warp.network.config import COMPACT
-from oasis_warp.network.hand_network import HandNetwork
-from oasis_warp.pretraining.distributed import ProcessInfo
-from oasis_warp.pretraining.pretrain import CHECKPOINT, WEIGHTS, PretrainConfig, pretrain
+from oasis_warp.pretraining.pretrain import CHECKPOINT, WEIGHTS, pretrain
 from oasis_warp.pretraining.prior_trainer import true_pictures
 from oasis_warp.pretraining.sharp_prior import (
     ADVERSARY,
@@ -21,16 +18,9 @@ from oasis_warp.pretraining.sharp_prior import (
     wide_difference,
 )
 
-ALONE = ProcessInfo(0, 1, torch.device("cpu"))
-SMALL = replace(COMPACT, image_size=32, width=16, heads=2, n_tokens=8, n_coarse=32, refine_layers=1, head_width=8)
-CONFIG = PretrainConfig(steps=4, warmup=2, precision="float32", checkpoint_every=2, log_every=1)
-
 
 def new_trainer(hand, **options):
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        network = HandNetwork(SMALL, hand)
-    return SharpPriorTrainer(network, CONFIG, ALONE, **options)
+    return SharpPriorTrainer(small_network(hand), CONFIG, ALONE, **options)
 
 
 @pytest.fixture(scope="module")

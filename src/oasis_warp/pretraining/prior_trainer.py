@@ -56,17 +56,25 @@ def draw_targets(prediction: Prediction, batch: TrainingBatch, network: HandNetw
 
 
 @torch.no_grad()
-def true_pictures(batch: TrainingBatch, faces: Int[Tensor, "F 3"], rim: Int[Tensor, "R"]) -> RenderBatch:
-    """The targets, faded out at the wrist like the Gaussians, which must not cover the skin beyond it."""
+def seen_on_targets(
+    of_vertices: Float[Tensor, "B V"], batch: TrainingBatch, faces: Int[Tensor, "F 3"], elsewhere: float
+) -> Float[Tensor, "N H H"]:
+    """Values of the vertices as the targets show them, and `elsewhere` where a target shows no hand."""
     size = batch.target_images.shape[2]
     seen = depth_map(
         batch.target_posed.flatten(0, 1), faces, batch.target_viewmats.flatten(0, 1), batch.target_Ks.flatten(0, 1),
         size, size, validate=False,
     )  # fmt: skip
-    at_vertices = rim_fade(batch.rest, rim).repeat_interleave(batch.target_posed.shape[1], 0)
+    at_vertices = of_vertices.repeat_interleave(batch.target_posed.shape[1], 0)
     corners = faces[seen.face_ids.clamp_min(0).long()]
     at_corners = at_vertices.gather(1, corners.flatten(1)).view(corners.shape)
-    fade = torch.where(seen.face_ids >= 0, (at_corners * seen.barycentrics).sum(-1), 1)
+    return torch.where(seen.face_ids >= 0, (at_corners * seen.barycentrics).sum(-1), elsewhere)
+
+
+@torch.no_grad()
+def true_pictures(batch: TrainingBatch, faces: Int[Tensor, "F 3"], rim: Int[Tensor, "R"]) -> RenderBatch:
+    """The targets, faded out at the wrist like the Gaussians, which must not cover the skin beyond it."""
+    fade = seen_on_targets(rim_fade(batch.rest, rim), batch, faces, 1.0)
     share = fade * batch.target_known.flatten(0, 1)
     return RenderBatch(batch.target_images.flatten(0, 1) * share[..., None], batch.target_masks.flatten(0, 1) * share)
 

@@ -19,7 +19,6 @@ from torch.nn.functional import avg_pool2d, leaky_relu, softplus
 from oasis_warp.avatar.observation import inner_mask, source_photos
 from oasis_warp.core.types import TrainingBatch
 from oasis_warp.network.hand_network import HandNetwork
-from oasis_warp.ops import depth_map
 from oasis_warp.pretraining.distributed import ProcessInfo, average_gradients, share_weights
 from oasis_warp.pretraining.pretrain import PretrainConfig, StepResult, load_checkpoint, save_checkpoint
 from oasis_warp.pretraining.prior_trainer import (
@@ -28,6 +27,7 @@ from oasis_warp.pretraining.prior_trainer import (
     draw_targets,
     objective,
     picture_psnr,
+    seen_on_targets,
     true_pictures,
 )
 
@@ -91,16 +91,8 @@ class HiddenSkin(NamedTuple):
 @torch.no_grad()
 def hidden_skin(batch: TrainingBatch, masks: Float[Tensor, "N H H"], network: HandNetwork) -> HiddenSkin:
     """Find the skin of the targets that the photos of `batch` hide; `masks` are those of `true_pictures`."""
-    size, faces = batch.target_images.shape[2], network.faces
-    seen = depth_map(
-        batch.target_posed.flatten(0, 1), faces, batch.target_viewmats.flatten(0, 1), batch.target_Ks.flatten(0, 1),
-        size, size, validate=False,
-    )  # fmt: skip
     confidence = network.observe(source_photos(batch)).confidence
-    at_vertices = confidence.repeat_interleave(batch.target_posed.shape[1], 0)
-    corners = faces[seen.face_ids.clamp_min(0).long()]
-    at_corners = at_vertices.gather(1, corners.flatten(1)).view(corners.shape)
-    share = torch.where(seen.face_ids >= 0, 1 - (at_corners * seen.barycentrics).sum(-1), 0).clamp(0, 1)
+    share = (1 - seen_on_targets(confidence, batch, network.faces, 1.0)).clamp(0, 1)
     judged = inner_mask(((share > 0.9) & (masks > 0.9)).to(masks), OUTLINE)
     return HiddenSkin(share, judged)
 
