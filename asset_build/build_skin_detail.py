@@ -71,7 +71,7 @@ PEOPLE, PALMS, LOUDEST_LINE = (3, 8), (4, 9), 2.0
 lines are taken; the strength of a line that is stored as 255. The photos' own lines are blurred."""
 PALM_LINES = {"crease": 1.4, "main": 1.35, "minor": 0.7, "halo": 0.3}
 """How dark lines of the palm are, in units of a clear fold: as the synthetic world draws them, halved by sRGB."""
-LINES_ON_PADS = 0.7
+LINES_ON_PADS = 0.45
 """How much of them stays on the palm's side of fingers: Gaussians of 1 mm draw lines as bars, darkest on painted skin
 that was straightened."""
 AROUND_PASSES = 20
