@@ -30,7 +30,7 @@ def shaded(hand, truth, log_shade):
     return truth._replace(shade=vertex_to_gaussians(log_shade, hand.faces, truth).exp())
 
 
-@pytest.mark.parametrize("shade", [(-0.2, -0.2, -0.2), (0.2, 0.15, 0.1)])
+@pytest.mark.parametrize("shade", [(-0.2, -0.2, -0.2), (0.1, 0.08, 0.05)])
 def test_smooth_shade_goes_on_behind_the_rim(hand, scene, shade):
     """From the side there was an edge where the photo's pale skin met painted skin."""
     crop, truth, _, light, seen = scene
@@ -42,6 +42,16 @@ def test_smooth_shade_goes_on_behind_the_rim(hand, scene, shade):
     near, far = ~shown & (distance > 0.004) & (distance < 0.006), ~shown & (distance > 0.02)
     torch.testing.assert_close(spread.shade[near].log().median(0).values, 0.8 * wanted, atol=0.05, rtol=0)
     assert float(spread.shade[far].log().abs().median()) < 0.6 * float(wanted.abs().max())
+
+
+def test_bright_shade_goes_on_only_a_little(hand, scene):
+    """Bright rims bleached the flanks of fingers behind them."""
+    crop, truth, _, light, seen = scene
+    gaussians = shaded(hand, truth, torch.where(shown_in(seen)[:, None], 0.25, 0.0).expand(-1, 3))
+    shade = spread_shade(hand, gaussians, crop, light)[1].shade
+    assert shade is not None
+    behind, shown = shade[seen.facing < -0.3].log(), shade[seen.confidence > 0.9].log()
+    assert float(behind.max()) < 0.11 < 0.2 < float(shown.median())
 
 
 def test_no_impossible_hue_goes_on_behind_the_rim(hand, scene):
@@ -78,8 +88,7 @@ def test_in_another_pose_no_part_of_the_hand_keeps_smooth_shade(hand, scene):
     after, spread = spread_shade(hand, shaded(hand, truth, log_shade), crop, light)
     fist = pose._replace(angles=named_pose(hand, "fist"))
     dark, plain = (
-        avatar_of(hand, g, pose, crop.camera, own).pose(fist).colors
-        for g, own in ((after, spread), (truth, light))
+        avatar_of(hand, g, pose, crop.camera, own).pose(fist).colors for g, own in ((after, spread), (truth, light))
     )
     ratio = (dark / plain).log()[: len(truth.vertex_index)]
     palm = ((label_regions(hand).palm > 0.9) & (hand.segment == 0))[truth.vertex_index]

@@ -17,6 +17,9 @@ RIM_WEIGHT = 0.3
 """Confidence at least of what the photo shows on a slant: painted skin begins there."""
 DARKEST, BRIGHTEST, MAX_HUE = -0.5, 0.3, 0.1
 """Range of the logarithm of smooth shade, and of each channel's difference from the mean of all."""
+BRIGHTEST_BEHIND = 0.1
+"""Largest logarithm of it behind what the photo shows: with `BRIGHTEST` a stranger saw bleached flanks of fingers in
+four of the photos in docs/looks.md."""
 MAX_FINE = 0.1
 """Logarithm that fine shade tends to: more is the edge of a shadow, which would stay on the palm without its shadow."""
 MAX_MOVED = 1.0
@@ -57,5 +60,5 @@ def spread_shade(
     # Not exp(moved) itself: light is read between vertices as a factor, and the photo's view must not change.
     lit = shading(light, posed_lighting(rest, crop.posed.vertices, faces, light))
     before, after = vertex_to_gaussians(torch.cat([lit * light.shade, lit * moved], 1), faces, gaussians).split(3, 1)
-    behind = moved * (hidden * (smooth - light.shade.log())).exp()
+    behind = moved * (hidden * (smooth.clamp_max(BRIGHTEST_BEHIND) - light.shade.log())).exp()
     return gaussians._replace(shade=gaussians.shade * before / after), light._replace(shade=behind)

@@ -53,13 +53,13 @@ PARTS = 2
 """An edge, of faces that are cut for the painting."""
 SHOWS_FORM = 0.3
 """Cosine between normal and view from which a photo shows the forms of skin that it shows on a slant."""
-ON_PALM, ON_BACK = 3.1, 1.25
-"""Gain of the maps' detail on palms and on backs."""
+ON_PALM, ON_BACK = 2.65, 1.25
+"""Gain of the maps' detail on palms and on backs. With 3.1 palms that ten photos of same_hand hide have .67/.61/.61/.66
+of real hands' contrast, but strangers saw blotches."""
 LOUDEST_ON_PALM, LOUDEST_ON_BACK = 0.2, 0.12
 """Logarithms of sRGB that this detail tends to. The maps have the same contrast all over palms, not over backs."""
 LINES_ON_PALM = 1.5
-"""Gain of the drawn lines of palms. With these gains palms that ten photos of same_hand hide have .67/.61/.61/.66 of
-real hands' contrast; with maps that were not even .65/.64/.65/.70, and dark rings and frames on fingers."""
+"""Gain of the drawn lines of palms."""
 FOLD, VEIN = (-0.10, -0.14, -0.15), (-0.07, -0.04, -0.04)
 """What a fold and a vein add to the logarithms of the colours."""
 USUAL_CONTRASTS = 0.023, 0.016
