@@ -95,7 +95,7 @@ def test_contrast_is_compared_by_size_of_detail_and_only_in_pictures_of_its_size
         compare_with_photo(avatar, Render(image, torch.ones(256, 256)), crop, fit.pose).contrasts
         for image in (crop.image, blurred)
     )
-    assert equal == pytest.approx([1.0] * 4)
+    assert equal is not None and soft is not None and equal == pytest.approx([1.0] * 4)
     assert soft[0] < 0.1 < soft[1] < soft[2] < 0.7 < soft[3] < 1.0
     assert score_in(scene, photo).contrasts is None
 
