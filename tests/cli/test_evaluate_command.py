@@ -24,6 +24,7 @@ from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.estimation.hand_crop import crop_hand
 from oasis_warp.evaluation import look_measures, looks, real_hands, same_hand, views
 from oasis_warp.evaluation.methods import ONE_SHOT, RAW, Method
+from oasis_warp.evaluation.metrics import HIDDEN_CONTRASTS, HIDDEN_LIKENESS
 from oasis_warp.evaluation.same_hand import compare_pairs, compare_with_photo, photos_of_hands, summarise_pairs
 from oasis_warp.evaluation.summary import read_result
 from oasis_warp.hand_avatar import draw_as_photo
@@ -335,7 +336,8 @@ def test_synthetic_hands_are_measured_and_printed(tmp_path, monkeypatch, capsys)
         {"group": group, "light": light, "noise": noise, "colors": colors, "prior": "mean", "stage": "calibrated",
          "people": 1, "pictures": 4, "psnr": 21.5 + noise, "gain": 0.0, "gain_error": None, "better": 0.0,
          "psnr_inner": 25.0, "psnr_visible": None, "psnr_hidden": 24.0, "psnr_stretched": None,
-         "psnr_squeezed": 20.0, "psnr_unchanged": 24.0, "ssim": 0.9, "ssim_box": 0.8, "ssim_mask": 0.7, "lpips": None}
+         "psnr_squeezed": 20.0, "psnr_unchanged": 24.0, "ssim": 0.9, "ssim_box": 0.8, "ssim_mask": 0.7, "lpips": None,
+         **dict.fromkeys((*HIDDEN_CONTRASTS, *HIDDEN_LIKENESS), 0.5)}
         for group in ("ordinary", "tattoo", "ring") for light in ("same", "studio", "wild")
         for noise in (0.0, 0.5, 1.0, 2.0, 4.0) for colors in ("raw", "matched")
     ]  # fmt: skip
@@ -350,7 +352,8 @@ def test_synthetic_hands_are_measured_and_printed(tmp_path, monkeypatch, capsys)
     assert main(["evaluate", "--out", str(tmp_path / "found"), *options]) == 0
     output = capsys.readouterr().out
     assert asked == [(["mean"], 3, 128, 5, "cpu")]
-    assert output.count("mean calibrated") == 9 * 2 + 1 and "LPIPS: no weights given" in output
+    assert output.count("mean calibrated") == 9 * 2 + 2 + 1 and "Skin that the photo hides" in output
+    assert "LPIPS: no weights given" in output
     assert "The same people with a tattoo" in output and "matched" in output and "visible" not in output
     assert re.search(r"mean calibrated .*21\.50.*22\.00.*22\.50.*23\.50.*25\.50", output)
 

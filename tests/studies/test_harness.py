@@ -15,7 +15,7 @@ from synthetic import crop_of
 from oasis_warp.avatar.observation import batch_of_crop
 from oasis_warp.core.errors import InputError
 from oasis_warp.evaluation.methods import METHODS
-from oasis_warp.evaluation.summary import SYNTHETIC, summarise
+from oasis_warp.evaluation.summary import HIDDEN, SYNTHETIC, summarise
 from oasis_warp.network.config import COMPACT
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.weights_file import load_network, save_network
@@ -178,8 +178,8 @@ def test_pages_name_the_commit_and_keep_what_has_no_rows(tmp_path):
 def test_evaluations_fill_their_pages(tmp_path):
     def picture(method, person, psnr, light, colors, noise):
         about = {"group": "ordinary", "light": light, "noise": noise, "colors": colors, "person": person, "target": 0}
-        return {**dict.fromkeys(SYNTHETIC, 0.5), **about, **method._asdict(), "lpips": None, "psnr_squeezed": None,
-                "psnr": psnr}  # fmt: skip
+        return {**dict.fromkeys((*SYNTHETIC, *HIDDEN), 0.5), **about, **method._asdict(), "lpips": None,
+                "psnr_squeezed": None, "psnr": psnr}  # fmt: skip
 
     methods = [method for method in METHODS if method.prior == "mean"]
     records = [
