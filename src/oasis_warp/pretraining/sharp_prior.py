@@ -149,7 +149,6 @@ class SharpPriorTrainer(PriorTrainer):
         drawn = draw_targets(prediction, batch, self.network)
         true = true_pictures(batch, self.network.faces, self.network.rim)
         hidden = hidden_skin(batch, true.alphas, self.network)
-        hidden = hidden_skin(batch, true.alphas, self.network)
         loss, terms = objective(prediction, drawn, true, self.losses, self.perceptual, 1 - hidden.share)
         more = self._hidden_terms(drawn, true, hidden)
         weights = {"wide": self.losses.rgb, "adversarial": self.sharp.adversarial, "features": self.sharp.features}
