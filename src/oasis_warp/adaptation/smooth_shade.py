@@ -33,9 +33,10 @@ def spread_shade(
 ) -> tuple[CanonicalGaussians, HandLight]:
     """Move the smooth part of the Gaussians' shade to the light's, and continue it behind what the photo shows.
 
-    The albedo that is fitted to a photo hardly varies over more than a centimetre, but the shade does. It ended where the photo does, which was an edge between two tones from
-    the side. In other poses it stayed on a palm and went from the fingers. The shade of the light ends on the whole
-    hand at once (`avatar.pose.remaining_shade`), and that of the Gaussians where skin turns. The photo's view stays.
+    The albedo that is fitted to a photo hardly varies over more than a centimetre, but the shade does. It ended where
+    the photo does, which was an edge between two tones from the side. In other poses it stayed on a palm and went from
+    the fingers. The shade of the light ends on the whole hand at once (`avatar.pose.remaining_shade`), and that of the
+    Gaussians where skin turns. The photo's view stays.
 
     Args:
         hand: Model of the surface.
