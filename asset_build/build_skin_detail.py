@@ -55,8 +55,9 @@ FINE, FINE_GAIN = 1.2, 2.5
 DARKER, COLOUR = (0.82, 1.06, 1.12), 0.3
 """How much each channel's logarithm changes in the shade of a fold, the colour of all that is fine but for a share: the
 maps' own is that of blocks of JPEG."""
-SOFT, ON_PALM_FINGERS, EVEN_REACH = 0.6, 3.0, 9.0
-"""Blurs [texels] of palms, of what is taken off the palm's side of fingers, and over which contrast is measured."""
+SOFT, WIDEST_ON_PALM, EVEN_REACH = 0.6, 2.5, 9.0
+"""Blurs [texels] of palms, of what is taken off them, and over which contrast is measured. What is wider than 2 mm on
+the pictures' palms are blotches."""
 PALM_CONTRAST, FLAT, PALM_LOUDEST, EVENINGS = 0.04, 0.012, 0.08, 2
 """Root mean square of the logarithms of a palm's detail, contrast below which skin is left smoother, and what this
 detail tends to; how often it is divided by its contrast and limited. Set by eye, as the blurs, on drawn hands."""
@@ -69,8 +70,13 @@ GREY, STEPS = 128, 400
 PEOPLE, PALMS, LOUDEST_LINE = (3, 8), (4, 9), 2.0
 """People of the synthetic world whose folds over the joints are taken, and the first one's veins; those whose palm's
 lines are taken; the strength of a line that is stored as 255. The photos' own lines are blurred."""
-PALM_LINES = {"crease": 1.4, "main": 1.35, "minor": 0.7, "halo": 0.3}
-"""How dark lines of the palm are, in units of a clear fold: as the synthetic world draws them, halved by sRGB."""
+PALM_LINES = {"crease": 1.4, "main": 1.35, "minor": 2.0, "wrinkle": 1.0, "halo": 0.3}
+"""How dark lines of the palm are, in units of a clear fold: as the synthetic world draws them, halved by sRGB. Fine
+lines are darker, because Gaussians draw them wider."""
+LINE_WEALTH, AGE = 1.0, 0.6
+"""How many lines these palms have: fine ones are most of what a palm shows at arm's length."""
+PAD_RIM = 3.0
+"""Blur of the border between fingers and palm [texels]."""
 LINES_ON_PADS = 0.45
 """How much of them stays on the palm's side of fingers: Gaussians of 1 mm draw lines as bars, darkest on painted skin
 that was straightened."""
@@ -186,7 +192,7 @@ def sharpened(detail: np.ndarray, on: np.ndarray) -> np.ndarray:
 
 
 def even_palm(hand: HandModel, detail: np.ndarray, faces: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """The detail of palms with the same contrast everywhere, and on fingers only what is fine.
+    """Only what is fine in the detail of palms, with the same contrast everywhere.
 
     In the pictures, creases are dark bars, the widest of pigment on dark skin, and the paint that fills the sides of
     fingers frames them: on straightened fingers, rings and frames as of nails. Divided by its contrast around,
@@ -199,7 +205,7 @@ def even_palm(hand: HandModel, detail: np.ndarray, faces: np.ndarray, places: np
         weight = cv2.GaussianBlur(on.astype(np.float64), (0, 0), reach)
         return cv2.GaussianBlur(values * on[..., None], (0, 0), reach) / np.maximum(weight, 1e-6)[..., None]
 
-    fine = around(detail - pads[..., None] * around(detail, ON_PALM_FINGERS), SOFT)
+    fine = around(detail - around(detail, WIDEST_ON_PALM), SOFT)
     for _ in range(EVENINGS):
         contrast = np.sqrt(around(np.square(fine), EVEN_REACH).mean(2, keepdims=True))
         fine = PALM_CONTRAST * fine / np.hypot(contrast, FLAT)
@@ -211,7 +217,7 @@ def even_palm(hand: HandModel, detail: np.ndarray, faces: np.ndarray, places: np
 def finger_pads(hand: HandModel, faces: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Share of the palm's side of fingers in each texel, [H, W]."""
     finger = on_texels((hand.segment > 0).double(), hand, faces, places)
-    return cv2.GaussianBlur(finger, (0, 0), ON_PALM_FINGERS) * on_texels(label_regions(hand).palm, hand, faces, places)
+    return cv2.GaussianBlur(finger, (0, 0), PAD_RIM) * on_texels(label_regions(hand).palm, hand, faces, places)
 
 
 def on_texels(values: torch.Tensor, hand: HandModel, faces: np.ndarray, places: np.ndarray) -> np.ndarray:
@@ -243,7 +249,7 @@ def lines_on_back(hand: HandModel, number: int) -> dict[str, torch.Tensor]:
 
 def lines_on_palm(hand: HandModel, number: int) -> torch.Tensor:
     """How dark the lines of one person's palm are, at its texels; 0 on the back."""
-    person = sample_identity(hand, 0, number, Population(hair=0))
+    person = sample_identity(hand, 0, number, Population(hair=0))._replace(line_wealth=LINE_WEALTH, age=AGE)
     lines = draw_lines(plan_skin(person).lines, texels_on("cpu").grid)
     return palm_share() * sum(gain * lines[name] for name, gain in PALM_LINES.items())
 

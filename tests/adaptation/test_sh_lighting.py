@@ -323,15 +323,17 @@ def test_the_photo_s_own_view_stays_as_it_is(hand, albedo_scene, factor):
 
 def test_a_shadow_goes_and_marks_stay(hand, albedo_scene):
     guess, _ = albedo_scene
+    border = hand.template[:, 0].median()
+    inner = vertex_to_gaussians((hand.template[:, :1] < border - 0.03).float(), hand.faces, guess)[:, 0] == 1
 
-    def share_that_stays(factor):
+    def share_that_stays(factor, where=True):
         learned, there = learned_on(hand, guess, factor)
         parted = split_albedo_shading(hand, guess.colors, learned)
-        there = there & (learned.colors > 0.03).all(1)
+        there = there & (learned.colors > 0.03).all(1) & where
         before, after = ((g.colors / guess.colors).log()[there] for g in (learned, parted))
         return float(after.norm() / before.norm())
 
-    assert share_that_stays(SHADOW) == pytest.approx(ALBEDO_SHARE, abs=0.02)
+    assert share_that_stays(SHADOW, inner) == pytest.approx(ALBEDO_SHARE, abs=0.03)  # its border is fine detail
     assert share_that_stays(HALF_INK) > 0.4
     assert share_that_stays(INK) > 0.95 and share_that_stays(POLISH) > 0.95  # but for faces at the border
 
@@ -347,14 +349,15 @@ def test_creases_stay(hand, albedo_scene):
     assert 0.9 < float((before * after).sum() / before.square().sum()) < 1.05
 
 
-def test_what_is_finer_than_the_vertices_is_shade_too(hand, albedo_scene):
+def test_what_is_finer_than_the_vertices_stays(hand, albedo_scene):
+    """Read at vertices only, a third of the finest detail of the skin was shade, and went when a finger bent."""
     guess, _ = albedo_scene
     n_vertices = len(guess.vertex_index)
     colors = guess.colors.clone()
-    colors[n_vertices::2] *= 0.8
+    colors[n_vertices::2] *= 0.9
     parted = split_albedo_shading(hand, guess.colors, guess._replace(colors=colors))
-    left = (parted.colors / guess.colors).log()[n_vertices::2]
-    torch.testing.assert_close(left, torch.full_like(left, ALBEDO_SHARE * math.log(0.8)), atol=1e-4, rtol=0)
+    left = (parted.colors / guess.colors).log()[n_vertices::2] / math.log(0.9)
+    assert float(left.min()) > 0.85
 
 
 def test_what_was_not_learned_does_not_change(hand, albedo_scene):
@@ -385,4 +388,4 @@ def test_ink_on_single_gaussians_is_no_mark(hand, albedo_scene):
     ratio = ((parted.colors / guess.colors).log().norm(dim=1) / (learned.colors / guess.colors).log().norm(dim=1))
     there = clear & (torch.arange(len(clear)) % 2 == n_vertices % 2)
     assert int(there.sum()) > 100
-    assert ratio[there].max() < ALBEDO_SHARE + 0.1
+    assert ratio[there].max() < 0.5

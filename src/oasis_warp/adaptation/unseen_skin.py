@@ -53,7 +53,7 @@ PARTS = 2
 """An edge, of faces that are cut for the painting."""
 SHOWS_FORM = 0.3
 """Cosine between normal and view from which a photo shows the forms of skin that it shows on a slant."""
-ON_PALM, ON_BACK = 2.65, 1.25
+ON_PALM, ON_BACK = 1.8, 1.25
 """Gain of the maps' detail on palms and on backs. With 3.1 palms that ten photos of same_hand hide have .67/.61/.61/.66
 of real hands' contrast, but strangers saw blotches."""
 LOUDEST_ON_PALM, LOUDEST_ON_BACK = 0.2, 0.12
