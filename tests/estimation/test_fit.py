@@ -18,13 +18,16 @@ from oasis_warp.estimation.fit_quality import (
 from oasis_warp.estimation.outline import MaskOutline, wrist_line
 
 SIZE = (480, 400)
+ANGLE_SIGMA = np.array([1.0, 0.25, 0.10])
+"""Deviations of flexion, abduction and twist of ordinary poses [rad]."""
 
 
 def posed_hand(kinematics, seed):
     """A right hand in an ordinary pose before a camera: palm or back, tilted a little."""
     rng = np.random.default_rng(seed)
     fitter = Fitter(kinematics, fit_target(np.zeros((21, 2)), None, SIZE, 500.0))
-    angles = np.clip(fitter.relaxed + 0.25 * rng.normal(size=26) * fitter.angle_sigma, fitter.low, fitter.high)
+    spread = 0.25 * ANGLE_SIGMA[kinematics.dofs[:, 1]]
+    angles = np.clip(fitter.relaxed + spread * rng.normal(size=26), fitter.low, fitter.high)
     shape = 0.7 * rng.normal(size=40)
     shape[6:10] = 0
     facing = cv2.Rodrigues(np.array([np.pi / 2 + np.pi * rng.integers(2), 0, 0]))[0]
@@ -201,7 +204,7 @@ def test_a_pose_beyond_its_limits_costs_alike_on_both_sides(kinematics, beyond):
     truth = posed_hand(kinematics, 0)
     fitter = Fitter(kinematics, seen(kinematics, truth))
     bound = fitter.low if beyond < 0 else fitter.high
-    flat = replace(fitter.settings, angle=((1e6, 1e6),) * 3, coupling=1e6)  # of the priors, only the limits count
+    flat = replace(fitter.settings, gesture=(1e6, 1e6, 1e6))  # of the priors, only the limits count
 
     def cost(angles):
         free = Fitter(kinematics, fitter.target, settings=replace(flat, landmark=1e6, bone=1e6), shape=truth.shape)

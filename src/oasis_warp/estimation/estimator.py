@@ -23,8 +23,8 @@ from oasis_warp.estimation.fit_quality import (
     finger_warnings,
     fit_quality,
     framing_warnings,
-    other_side_cost,
     second_detections,
+    side_costs,
     side_warnings,
     stray_pixels,
 )
@@ -140,8 +140,8 @@ class HandEstimator:
         framing = framing_warnings(view.target, mask)
         warnings = [*quality.warnings(), *warnings, *framing, *fingers, *stray_fingers]
         if landmarks.world is not None:  # 21 points in the plane alone do not tell a palm from the other hand's back
-            other_cost = other_side_cost(self.kinematics, view.target, known_shape)
-            warnings += side_warnings(landmarks.side, start.cost, other_cost, detections)
+            costs = side_costs(self.kinematics, view.target, known_shape)
+            warnings += side_warnings(landmarks.side, *costs, detections)
         refused = quality.beyond(REFUSE_BOUNDS)
         if len(fingers) >= MANY_FINGERS:
             refused.append("a second detection places the hand elsewhere")

@@ -12,6 +12,7 @@ import numpy as np
 
 from oasis_warp.core.hand_model import KNUCKLES
 from oasis_warp.estimation.fit_problem import FitState, FitTarget, Linearized
+from oasis_warp.estimation.gesture_prior import gesture_prior
 from oasis_warp.estimation.landmarks import BONES
 from oasis_warp.estimation.least_squares import Damping, QuadraticModel, cauchy, charbonnier, minimize
 from oasis_warp.hand.kinematics import HandKinematics, PosedJoints, rotation_between, unit
@@ -37,12 +38,10 @@ class FitSettings:
     """Sigma of unit bone directions."""
     limit: float = 0.05
     """Beyond a pose limit [rad]."""
-    coupling: float = 0.3
-    """Sigma of the flexion of an end joint about 2/3 of the middle joint's [rad]."""
-    angle: tuple[tuple[float, float], ...] = ((1.0, 0.5), (0.25, 0.35), (0.10, 0.25))
-    """Sigmas of flexion, abduction and twist about the relaxed pose, each for fingers and thumb [rad]."""
+    gesture: tuple[float, float, float] = (0.25, 0.2, 0.1)
+    """Standard deviations of a real hand's flexion, abduction and twist from the gestures of the prior [rad]."""
     relaxed: tuple[float, float, float] = (0.25, 0.45, 0.25)
-    """Flexion of a relaxed finger's three joints [rad]."""
+    """Flexion of a finger's three joints from which fits start [rad]."""
     shape: float = 1.0
     silent_shape: float = 0.0003
     """Principal components that move the surface less than this are fixed, because no photo shows them [m, rms]."""
@@ -68,6 +67,8 @@ class FitSettings:
     """Sigmas of landmarks and of bone directions where pixels are read, too."""
 
 
+_GESTURES, _GESTURE_STEPS = 8, 4
+"""Gestures from which the fit to pixels goes on, those nearest to the fit before, and the steps that compare them."""
 _FIXED = 1e-4
 """Sigma of a shape coefficient that is fixed at its prior."""
 
@@ -124,11 +125,8 @@ class Fitter:
         joint, axis = kinematics.dofs.T
         finger_flexion = (axis == 0) & (joint < 13)
         self.relaxed = np.where(finger_flexion, np.array(s.relaxed)[(joint - 1) % 3], 0.0)
-        self.angle_sigma = np.array(s.angle)[axis, (joint >= 13).astype(int)]
+        self.gestures = gesture_prior(kinematics, s.gesture)
         self.low, self.high = kinematics.limits[joint, axis].T
-        row = {(int(j), int(a)): i for i, (j, a) in enumerate(kinematics.dofs)}
-        self.middle, self.end = (np.array([row[j, 0] for j in joints]) for joints in ((2, 5, 8, 11), (3, 6, 9, 12)))
-        self.end_bend = kinematics.rest_bend[[3, 6, 9, 12]] - 2 / 3 * kinematics.rest_bend[[2, 5, 8, 11]]
         n_shape = kinematics.shape_basis.shape[2]
         if shape is None:
             self.shape_mean, self.shape_sigma = np.zeros(n_shape), np.full(n_shape, s.shape)
@@ -147,9 +145,9 @@ class Fitter:
 
     def system(
         self, state: FitState, *, landmarks: bool = True, robust: bool = True, pairs: OutlinePairs | None = None,
-        surface: SurfacePoints | None = None,
+        surface: SurfacePoints | None = None, gesture: int | None = None,
     ) -> tuple[np.ndarray, np.ndarray, float]:  # fmt: skip
-        """Weighted residuals, their Jacobian by a step, and the robust cost."""
+        """Weighted residuals, their Jacobian by a step, and the robust cost, in the likeliest gesture or a given one."""
         s, box = self.settings, self.target.box
         sigma, bone = (s.landmark, s.bone) if surface is None else (s.weak_landmark, s.weak_bone)
         sigma *= box
@@ -164,7 +162,7 @@ class Fitter:
             residuals.append((error * weight[:, None]).ravel())
             jacobians.append((points.d_image * (weight / sigma)[:, None, None]).reshape(-1, n))
             cost += float(loss.sum())
-        for residual, jacobian in (*self._bone_term(points, bone), *self._priors(state, n)):
+        for residual, jacobian in (*self._bone_term(points, bone), *self._priors(state, n, gesture)):
             residuals.append(residual)
             jacobians.append(jacobian)
             cost += float(residual @ residual)
@@ -219,14 +217,13 @@ class Fitter:
         terms.append((error * weight, slope * (weight / s.normal)[..., None], float(loss.sum() * share)))
         return terms
 
-    def _priors(self, state: FitState, n: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    def _priors(self, state: FitState, n: int, gesture: int | None) -> list[tuple[np.ndarray, np.ndarray]]:
         s, eye = self.settings, np.eye(n)
         angles = slice(6, 6 + self.n_angles)
         over = np.maximum(state.angles - self.high, 0) + np.minimum(state.angles - self.low, 0)
-        bend = state.angles[self.end] - 2 / 3 * state.angles[self.middle] + self.end_bend
+        unlike, slope = self.gestures.term(state.angles, gesture)
         return [
-            ((state.angles - self.relaxed) / self.angle_sigma, eye[angles] / self.angle_sigma[:, None]),
-            (bend / s.coupling, (eye[6 + self.end] - 2 / 3 * eye[6 + self.middle]) / s.coupling),
+            (unlike, slope @ eye[angles]),
             (over / s.limit, eye[angles] * (over != 0)[:, None] / s.limit),
             ((state.shape - self.shape_mean) / self.shape_sigma,
              eye[6 + self.n_angles : -1] / self.shape_sigma[:, None]),
@@ -261,8 +258,14 @@ class Fitter:
         return min(found, key=lambda solution: solution.cost)
 
     def fit_surface(self, state: FitState, surface: SurfacePoints) -> Solution:
-        """Fit to what pixels show of the surface, beside landmarks of little weight."""
-        return self.solve(state, 8, self.everything, tolerance=1e-3, surface=self._corrected(surface, state))
+        """Fit to what pixels show of the surface, beside landmarks of little weight; in the gesture that fits best."""
+        state = self.solve(state, 8, self.everything, tolerance=1e-3, surface=self._corrected(surface, state)).state
+        terms, nearest = {"surface": self._corrected(surface, state)}, self.gestures.scores(state.angles)
+        tried = [
+            self.solve(state, _GESTURE_STEPS, self.everything, tolerance=1e-3, gesture=int(k), **terms)
+            for k in nearest.argsort(kind="stable")[:_GESTURES]
+        ]
+        return min(tried, key=lambda solution: solution.cost)
 
     def refine(
         self, state: FitState, match: Callable[[FitState], OutlinePairs], rounds: int,
