@@ -145,7 +145,7 @@ the flank of a tendon, of slope .4, by 37 % to either side: by .17 in sRGB, and 
 the light is taken to be from all around. On the hand a1_wood_right of tests/data/photos/same_hand the photo of the back
 has a contrast of 5.1 / 7.5 % at 2-4 / 4-8 px, its painted back 3.7 / 5.1 with two thirds of this and 4.8 / 6.4 with
 four thirds, which looks bony: set between these by eye."""
-PALM_PER_MM = (0.14, 0.22, 0.24)
+PALM_PER_MM = (0.17, 0.26, 0.28)
 """The same on palms: light that reached a hollow through the skin is red."""
 WIDE, WIDE_PASSES = 1.3, 6
 """How much more the wide part of a back's relief adds, and the smoothings over the mesh that leave it, 5 mm. With .85
