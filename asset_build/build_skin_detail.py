@@ -70,11 +70,9 @@ GREY, STEPS = 128, 400
 PEOPLE, PALMS, LOUDEST_LINE = (3, 8), (4, 9), 2.0
 """People of the synthetic world whose folds over the joints are taken, and the first one's veins; those whose palm's
 lines are taken; the strength of a line that is stored as 255. The photos' own lines are blurred."""
-PALM_LINES = {"crease": 1.4, "main": 1.35, "minor": 2.0, "wrinkle": 1.0, "halo": 0.3}
-"""How dark lines of the palm are, in units of a clear fold: as the synthetic world draws them, halved by sRGB. Fine
-lines are darker, because Gaussians draw them wider."""
-LINE_WEALTH, AGE = 1.0, 0.6
-"""How many lines these palms have: fine ones are most of what a palm shows at arm's length."""
+PALM_LINES = {"crease": 1.4, "main": 1.35, "minor": 0.7, "wrinkle": 0.5, "halo": 0.3}
+"""How dark lines of the palm are, in units of a clear fold: as the synthetic world draws them, halved by sRGB. With more
+and darker fine lines strangers saw a hairy rash."""
 PAD_RIM = 3.0
 """Blur of the border between fingers and palm [texels]."""
 LINES_ON_PADS = 0.45
@@ -249,7 +247,7 @@ def lines_on_back(hand: HandModel, number: int) -> dict[str, torch.Tensor]:
 
 def lines_on_palm(hand: HandModel, number: int) -> torch.Tensor:
     """How dark the lines of one person's palm are, at its texels; 0 on the back."""
-    person = sample_identity(hand, 0, number, Population(hair=0))._replace(line_wealth=LINE_WEALTH, age=AGE)
+    person = sample_identity(hand, 0, number, Population(hair=0))
     lines = draw_lines(plan_skin(person).lines, texels_on("cpu").grid)
     return palm_share() * sum(gain * lines[name] for name, gain in PALM_LINES.items())
 

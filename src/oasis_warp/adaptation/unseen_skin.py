@@ -57,9 +57,8 @@ ON_PALM, ON_BACK = 2.0, 1.25
 """Gain of the maps' detail on palms and on backs."""
 LOUDEST_ON_PALM, LOUDEST_ON_BACK = 0.2, 0.12
 """Logarithms of sRGB that this detail tends to. The maps have the same contrast all over palms, not over backs."""
-LINES_ON_PALM = 2.0
-"""Gain of the drawn lines of palms. With 1.5, and 1.8 times the detail and .8 times the relief, palms that six photos of
-same_hand hide have .05 less of real hands' contrast; with 2.3 lines look drawn."""
+LINES_ON_PALM = 1.8
+"""Gain of the drawn lines of palms."""
 FOLD, VEIN = (-0.10, -0.14, -0.15), (-0.07, -0.04, -0.04)
 """What a fold and a vein add to the logarithms of the colours."""
 USUAL_CONTRASTS = 0.023, 0.016
