@@ -20,6 +20,7 @@ from scipy.sparse.linalg import splu
 from oasis_warp.adaptation.inpainting import laplacian_and_mass
 from oasis_warp.adaptation.skin_detail import FORM_UNIT
 from oasis_warp.avatar.appearance import label_regions
+from oasis_warp.avatar.wrist import shade_left
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.surface import mesh_edges, smooth_over_mesh
 from oasis_warp.hand.template import bundled_hand
@@ -71,8 +72,8 @@ PEOPLE, PALMS, LOUDEST_LINE = (3, 8), (4, 9), 2.0
 """People of the synthetic world whose folds over the joints are taken, and the first one's veins; those whose palm's
 lines are taken; the strength of a line that is stored as 255. The photos' own lines are blurred."""
 PALM_LINES = {"crease": 1.4, "main": 1.35, "minor": 0.7, "wrinkle": 0.5, "halo": 0.3}
-"""How dark lines of the palm are, in units of a clear fold: as the synthetic world draws them, halved by sRGB. With more
-and darker fine lines strangers saw a hairy rash."""
+"""How dark lines of the palm are, in units of a clear fold: as the synthetic world draws them, halved by sRGB. More and
+darker fine lines looked like a hairy rash to strangers."""
 PAD_RIM = 3.0
 """Blur of the border between fingers and palm [texels]."""
 LINES_ON_PADS = 0.45
@@ -109,6 +110,8 @@ def main(folder: Path) -> None:
     drawn = [fold["fold"] + palm for fold, palm in zip(folds, palms, strict=True)]
     lines = 255 * resampled(torch.stack([*drawn, folds[0]["vein"]], 1) / LOUDEST_LINE, faces, places)
     lines *= 1 - (1 - LINES_ON_PADS) * share
+    before_wrist = shade_left(hand, hand.template)[:, 0]  # Gaussians stay coarse there, and thin lines would be dots
+    lines *= on_texels(before_wrist, hand, faces, places)[..., None]
     write(target / "lines.png", spread_out(np.rint(np.clip(lines, 0, 255)).astype(np.uint8), faces >= 0, fill=0))
     write(target / "nails.png", spread_out(nails(hand, faces, places), faces >= 0))
     write_relief(hand, target / "relief.npz")

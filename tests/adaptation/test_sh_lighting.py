@@ -360,6 +360,17 @@ def test_what_is_finer_than_the_vertices_stays(hand, albedo_scene):
     assert float(left.min()) > 0.85
 
 
+def test_what_turns_into_the_arm_does_not_stay(hand, albedo_scene):
+    """A bright fold at the root of the arm was a yellow smear on every pose; a tattoo there stays."""
+    guess, _ = albedo_scene
+    nothing = torch.zeros(len(hand.template))
+    for factor, stays in ((SHADOW, 0.0), (INK, 0.95)):
+        learned, there = learned_on(hand, guess, factor)
+        parted = split_albedo_shading(hand, guess.colors, learned, left=nothing)
+        before, after = ((g.colors / guess.colors).log()[there].norm() for g in (learned, parted))
+        assert float(after / before) == pytest.approx(stays, abs=0.06)
+
+
 def test_what_was_not_learned_does_not_change(hand, albedo_scene):
     guess, _ = albedo_scene
     parted = split_albedo_shading(hand, guess.colors, guess)

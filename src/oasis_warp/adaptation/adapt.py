@@ -25,6 +25,7 @@ from oasis_warp.adaptation.unlit import (
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.observation import inner_mask, observe
 from oasis_warp.avatar.pose import in_even_light, posed_lighting, shading_factors
+from oasis_warp.avatar.wrist import shade_left
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
@@ -158,7 +159,8 @@ def adapt(
     if photos.lights is not None:
         weight = photos.observations.confidence * photos.observations.share
         trust = ((weight * photos.trust).sum(0) + UNSEEN) / (weight.sum(0) + UNSEEN)
-        gaussians = split_albedo_shading(hand, calibrated.colors, gaussians, trust)
+        left = shade_left(hand, crops[0].rest.vertices)[:, 0]
+        gaussians = split_albedo_shading(hand, calibrated.colors, gaussians, trust, left)
     return result._replace(gaussians=gaussians, losses=texture.losses)
 
 

@@ -2,8 +2,9 @@
 
 Two photos of one hand agree on little of what they show beyond the prior. Where skin faces as before, a third to a half
 of it is found again; where skin has turned by more than 45 degrees, a tenth at most (docs/avatar.md). The rest is
-shadows, gloss, wrinkles of the pose, and misplaced detail. So most of it becomes shade: the photo's own view keeps it
-and other poses lose it. Only marks whose colours light cannot give to skin stay in the albedo as a whole.
+shadows, gloss, wrinkles of the pose, and misplaced detail. So most of what is wide becomes shade: the photo's own view
+keeps it and other poses lose it. Marks whose colours light cannot give to skin stay in the albedo as a whole, and so
+does what is fine: a hand without pores, creases and relief looks like wax.
 """
 
 import torch
@@ -292,8 +293,9 @@ MARK_BRIGHTNESSES = 0.45, 0.7
 
 
 def split_albedo_shading(
-    hand: HandModel, guess: Float[Tensor, "N 3"], learned: CanonicalGaussians, trust: Float[Tensor, "V"] | None = None
-) -> CanonicalGaussians:
+    hand: HandModel, guess: Float[Tensor, "N 3"], learned: CanonicalGaussians, trust: Float[Tensor, "V"] | None = None,
+    left: Float[Tensor, "V"] | None = None,
+) -> CanonicalGaussians:  # fmt: skip
     """Split off part of the learned Gaussians' colours as shade; colours times shade stay as they were.
 
     Args:
@@ -301,17 +303,18 @@ def split_albedo_shading(
         guess: Colours of the Gaussians before they were learned.
         learned: In even light.
         trust: Result of `trust_in_albedo`, 1 if not given: the rest of what was learned is all shade, marks or not.
+        left: Share that is left on skin without marks, 1 if not given: 0 where the hand turns into the arm.
     """
     ratio = learned.colors.clamp_min(MIN_COLOR) / guess.clamp_min(MIN_COLOR)
     beyond = ratio.log().clamp(-MAX_LOG_SHADE, MAX_LOG_SHADE)
     of_vertices = vertex_colors(learned._replace(colors=beyond), len(hand.template))
     faces, no_mark = hand.faces.to(guess.device), 1 - mark_probability(of_vertices)
     smooth = surface.smooth_over_mesh(of_vertices, surface.mesh_edges(faces), FINE_PASSES)
-    trust = torch.ones_like(no_mark[:, 0]) if trust is None else trust
-    read = vertex_to_gaussians(torch.cat([smooth, no_mark, trust[:, None]], 1), faces, learned)
+    trust, left = (torch.ones_like(no_mark[:, 0]) if share is None else share for share in (trust, left))
+    read = vertex_to_gaussians(torch.cat([smooth, no_mark, trust[:, None], left[:, None]], 1), faces, learned)
     fine = (beyond - read[:, :3]).clamp(-MAX_FINE, MAX_FINE)
-    albedo = ALBEDO_SHARE * beyond + (FINE_SHARE - ALBEDO_SHARE) * fine
-    albedo = read[:, 4:] * torch.lerp(beyond, albedo, read[:, 3:4])
+    skin = read[:, 5:] * (ALBEDO_SHARE * beyond + (FINE_SHARE - ALBEDO_SHARE) * fine)
+    albedo = read[:, 4:5] * torch.lerp(beyond, skin, read[:, 3:4])
     colors = (guess.clamp_min(MIN_COLOR) * albedo.exp()).clamp(max=1)
     return learned._replace(colors=colors, shade=learned.colors.clamp_min(MIN_SHOWN) / colors)
 

@@ -83,7 +83,7 @@ def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tens
 
     shade = kept.shade
     if shade is not None:
-        shade = shade ** vertex_to_gaussians(_shade_left(hand, rest), faces, kept)
+        shade = shade ** vertex_to_gaussians(shade_left(hand, rest), faces, kept)
     return CanonicalGaussians(
         torch.cat([kept.vertex_index, vertices, index]),
         torch.cat([kept.offsets, torch.zeros_like(rest[vertices]), offsets]),
@@ -99,11 +99,11 @@ def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tens
 
 def end_shade(hand: HandModel, light: HandLight, rest: Float[Tensor, "V 3"]) -> HandLight:
     """`light` whose shade ends before the wrist, as the shade of Gaussians does in `close_wrist`."""
-    return light if light.shade is None else light._replace(shade=light.shade ** _shade_left(hand, rest))
+    return light if light.shade is None else light._replace(shade=light.shade ** shade_left(hand, rest))
 
 
-def _shade_left(hand: HandModel, rest: Tensor) -> Float[Tensor, "V 1"]:
-    """The power of shade that is left at each vertex."""
+def shade_left(hand: HandModel, rest: Tensor) -> Float[Tensor, "V 1"]:
+    """The power of the photo's shade that is left at each vertex: 0 at the wrist's end, 1 before `SHADE_FADE`."""
     return rim_fade(rest[None], hand.rim.to(rest.device), RIM_FADE, SHADE_FADE)[0, :, None]
 
 
