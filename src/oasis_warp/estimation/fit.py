@@ -147,7 +147,7 @@ class Fitter:
         self, state: FitState, *, landmarks: bool = True, robust: bool = True, pairs: OutlinePairs | None = None,
         surface: SurfacePoints | None = None, gesture: int | None = None,
     ) -> tuple[np.ndarray, np.ndarray, float]:  # fmt: skip
-        """Weighted residuals, their Jacobian by a step, and the robust cost, in the likeliest gesture or a given one."""
+        """Weighted residuals, their Jacobian by a step, and the robust cost in the likeliest gesture or a given one."""
         s, box = self.settings, self.target.box
         sigma, bone = (s.landmark, s.bone) if surface is None else (s.weak_landmark, s.weak_bone)
         sigma *= box
