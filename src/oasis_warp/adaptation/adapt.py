@@ -159,8 +159,8 @@ def adapt(
     if photos.lights is not None:
         weight = photos.observations.confidence * photos.observations.share
         trust = ((weight * photos.trust).sum(0) + UNSEEN) / (weight.sum(0) + UNSEEN)
-        left = shade_left(hand, crops[0].rest.vertices)[:, 0]
-        gaussians = split_albedo_shading(hand, calibrated.colors, gaussians, trust, left)
+        hand_share = shade_left(hand, crops[0].rest.vertices)[:, 0]
+        gaussians = split_albedo_shading(hand, calibrated.colors, gaussians, trust, hand_share)
     return result._replace(gaussians=gaussians, losses=texture.losses)
 
 

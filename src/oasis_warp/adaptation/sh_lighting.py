@@ -277,9 +277,10 @@ ALBEDO_SHARE, FINE_SHARE = 0.2, 1.0
 nails stay on the skin, and light hardly changes so fast on it, but in sharp shadows beside outlines, which go before
 (`scraps`). Set by eye, as the two below; with .8 of the fine part, ten photos of same_hand keep .02 less of their
 contrast in other poses."""
-FINE_PASSES = 60
-"""Smoothings over the mesh that leave the wide part, about 15 mm: with 9, or 6 mm, four photos of same_hand keep .65 of
-their contrast at 4-8 px in other poses, with these .72."""
+FINE_PASSES, FINE_PASSES_AT_WRIST = 60, 9
+"""Smoothings over the mesh that leave the wide part, about 15 mm and 6 mm. With 9 everywhere, four photos of same_hand
+keep .65 of their contrast at 4-8 px in other poses, with 60 .72; but where the hand turns into the arm, wider folds are
+smears on a hand without its arm."""
 MAX_FINE = 0.3
 """Largest fine part, as a logarithm; more is a sharp shadow, gloss, or another part of the hand."""
 ACROSS_SHADING = ((-18.0, 21.3, -7.5), (8.8, 4.6, -8.1))
@@ -294,7 +295,7 @@ MARK_BRIGHTNESSES = 0.45, 0.7
 
 def split_albedo_shading(
     hand: HandModel, guess: Float[Tensor, "N 3"], learned: CanonicalGaussians, trust: Float[Tensor, "V"] | None = None,
-    left: Float[Tensor, "V"] | None = None,
+    hand_share: Float[Tensor, "V"] | None = None,
 ) -> CanonicalGaussians:  # fmt: skip
     """Split off part of the learned Gaussians' colours as shade; colours times shade stay as they were.
 
@@ -303,18 +304,21 @@ def split_albedo_shading(
         guess: Colours of the Gaussians before they were learned.
         learned: In even light.
         trust: Result of `trust_in_albedo`, 1 if not given: the rest of what was learned is all shade, marks or not.
-        left: Share that is left on skin without marks, 1 if not given: 0 where the hand turns into the arm.
+        hand_share: 0 where the hand turns into the arm and less of what is wide stays, 1 before; 1 if not given.
     """
     ratio = learned.colors.clamp_min(MIN_COLOR) / guess.clamp_min(MIN_COLOR)
     beyond = ratio.log().clamp(-MAX_LOG_SHADE, MAX_LOG_SHADE)
     of_vertices = vertex_colors(learned._replace(colors=beyond), len(hand.template))
     faces, no_mark = hand.faces.to(guess.device), 1 - mark_probability(of_vertices)
-    smooth = surface.smooth_over_mesh(of_vertices, surface.mesh_edges(faces), FINE_PASSES)
-    trust, left = (torch.ones_like(no_mark[:, 0]) if share is None else share for share in (trust, left))
-    read = vertex_to_gaussians(torch.cat([smooth, no_mark, trust[:, None], left[:, None]], 1), faces, learned)
+    edges = surface.mesh_edges(faces)
+    narrow = surface.smooth_over_mesh(of_vertices, edges, FINE_PASSES_AT_WRIST)
+    smooth = surface.smooth_over_mesh(narrow, edges, FINE_PASSES - FINE_PASSES_AT_WRIST)
+    trust, hand_share = (torch.ones_like(no_mark[:, 0]) if share is None else share for share in (trust, hand_share))
+    smooth = torch.lerp(narrow, smooth, hand_share[:, None])
+    read = vertex_to_gaussians(torch.cat([smooth, no_mark, trust[:, None]], 1), faces, learned)
     fine = (beyond - read[:, :3]).clamp(-MAX_FINE, MAX_FINE)
-    skin = read[:, 5:] * (ALBEDO_SHARE * beyond + (FINE_SHARE - ALBEDO_SHARE) * fine)
-    albedo = read[:, 4:5] * torch.lerp(beyond, skin, read[:, 3:4])
+    skin = ALBEDO_SHARE * beyond + (FINE_SHARE - ALBEDO_SHARE) * fine
+    albedo = read[:, 4:] * torch.lerp(beyond, skin, read[:, 3:4])
     colors = (guess.clamp_min(MIN_COLOR) * albedo.exp()).clamp(max=1)
     return learned._replace(colors=colors, shade=learned.colors.clamp_min(MIN_SHOWN) / colors)
 
