@@ -240,7 +240,7 @@ def test_detail_is_on_the_skin_and_not_in_its_shade(hand, case):
     assert len(plain.colors) == len(made.gaussians.colors)
     torch.testing.assert_close(shade * colors, plain.colors[new], atol=0.05, rtol=0)
     of_coarse = coarse.shade.log().abs().mean()
-    assert float(of_coarse) > 0.005  # all of the fine part is albedo
+    assert float(of_coarse) > 0.002  # there is some; what is finer than 15 mm is albedo
     assert abs(float(shade.log().abs().mean() / of_coarse) - 1) < 0.5
 
 
