@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.avatar.pose import GAMMA, SurfaceLight, in_even_light, pose_gaussians, with_photo, with_self_occlusion
+from oasis_warp.core.camera import camera_center
 from oasis_warp.core.color import plain_background
 from oasis_warp.core.config import BLACK, WHITE
 from oasis_warp.core.hand_model import MANO_SHAPES, HandModel
@@ -107,9 +108,10 @@ class Avatar:
         self._rest_mesh = vertices if vertices.requires_grad else rest_mesh(vertices, self.hand.faces, validate=False)
         self._light = None
         if light is not None:
-            known = with_photo(light, self.rest.vertices, self._photo_surface(), self.hand.faces, gaussians)
-            mirrored = SurfaceLight(mirror_light(light), mirror_points(known.normals), known.seen, known.end)
-            self._light = mirrored if left else known
+            camera = mirror_camera(source_camera) if left else source_camera
+            center = camera_center(camera.viewmat.to(vertices))
+            known = with_photo(light, self.rest.vertices, self._photo_surface(), self.hand.faces, gaussians, center)
+            self._light = _mirror_surface_light(known) if left else known
         self._fixed = *(part for part in self._canonical if part is not None), vertices, self._rest.joints
         self._source_angles = source_pose.angles.to(self.shape)
         self._graphs = GraphCache()
@@ -184,12 +186,14 @@ class Avatar:
         posed = skin(self._model, self._rest, pose)
         return posed._replace(vertices=self._resolve_contact(posed.vertices, pose))
 
-    def pose(self, pose: HandPose | str, *, validate: bool = True) -> Gaussians:
+    def pose(self, pose: HandPose | str, *, camera: Camera | None = None, validate: bool = True) -> Gaussians:
         """The Gaussians in `pose`, in the world of its orientation and translation, where its light stays too.
 
         Args:
             pose: One, or with an axis in front of every part many: then means, quats and scales have it too, and
                 colours where there is a `light`. Or the name of one, as in `held`.
+            camera: What will see them: the photo's shade fades as it leaves the photo's side. Without one, colours do
+                not depend on the view; they are those seen from the photo's side.
             validate: Look at the pose's values too. Waits for a CUDA device if they are there.
 
         Raises:
@@ -197,8 +201,15 @@ class Avatar:
             ValueError: a part of the pose has another shape or is not finite, or no pose has that name.
         """
         checked = self._checked(pose, validate)
+        center = None if camera is None else camera_center(self._checked_viewmat(camera, validate))
         posed = self._resolve_contact(skin_surface(self._model, self._rest, checked), checked)
-        return pose_gaussians(self._canonical, self.hand.faces, self._rest_mesh, posed, self._light)
+        return pose_gaussians(self._canonical, self.hand.faces, self._rest_mesh, posed, self._light, center)
+
+    def _checked_viewmat(self, camera: Camera, validate: bool) -> Float[Tensor, "4 4"]:
+        check_shape("camera.viewmat", camera.viewmat, 4, 4)
+        if validate:
+            check_finite(viewmat=camera.viewmat)
+        return camera.viewmat.to(self.shape)
 
     def render(
         self, camera: Camera, pose: HandPose | str, background: Color = WHITE, *, validate: bool = True
@@ -234,8 +245,9 @@ class Avatar:
 
         def draw(*parts: Tensor) -> tuple[Tensor, ...]:
             *posed, viewmat, K, color = (part.to(self.shape) for part in parts)
-            gaussians = self.pose(HandPose(*posed), validate=False)
-            return tuple(render(gaussians, Camera(viewmat, K, *size), background=color))
+            camera = Camera(viewmat, K, *size)
+            gaussians = self.pose(HandPose(*posed), camera=camera, validate=False)
+            return tuple(render(gaussians, camera, background=color))
 
         size = camera.width, camera.height
         if self.shape.dtype == torch.float32 and replayable(self.device, (*inputs, *self._fixed)):
@@ -353,6 +365,11 @@ class Avatar:
         albedo = self._mean_albedo(self.light.even) if self.light.albedo is None else self.light.albedo
         light = with_self_occlusion(self.light, albedo, self.rest.vertices, self._photo_surface(), self.hand.faces)
         return self.with_looks(self.gaussians, light)
+
+
+def _mirror_surface_light(light: SurfaceLight) -> SurfaceLight:
+    view = None if light.photo_view is None else mirror_points(light.photo_view)
+    return light._replace(light=mirror_light(light.light), normals=mirror_points(light.normals), photo_view=view)
 
 
 def check_pose_type(pose: HandPose) -> None:

@@ -17,6 +17,7 @@ from oasis_warp.avatar.pose import (
 )
 from oasis_warp.avatar.sky import bounced, environment_light, harmonic_basis, radiance, sky_mesh, studio_light
 from oasis_warp.core import rotation
+from oasis_warp.core.camera import camera_center
 from oasis_warp.core.mirror import mirror_light, mirror_points
 from oasis_warp.core.types import HandLight
 from oasis_warp.data import avatar_file
@@ -266,3 +267,42 @@ def test_detail_that_takes_back_a_shadow_is_no_white_skin(hand, scene):
         torch.testing.assert_close(made.colors * made.shade, torch.full_like(colors, shown))
         doubted = with_photo_colors(shaded, every, torch.full_like(colors, shown), 0 * trust)
         torch.testing.assert_close(doubted.colors, colors)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_shade_fades_as_the_camera_leaves_the_photos_side(hand, scene, side):
+    """Seen from the side, what photos showed on a slant were stains: black finger tips, bruises, streaks of floor."""
+    crop, truth, pose = scene
+    facing = posed_lighting(crop.rest.vertices, crop.posed.vertices, hand.faces, EVEN).normals
+    shaded = EVEN._replace(shade=torch.full_like(facing, 0.5), facing=facing)
+    plain, dark = (avatar_of(hand, truth, pose, crop.camera, light) for light in (EVEN, shaded))
+    if side == "left":
+        plain, dark = as_left_hand(plain), as_left_hand(dark)
+    source, vertices = dark.source_camera, dark.mesh(dark.source_pose).vertices
+    middle = vertices.mean(0)
+
+    def ratio(degrees, nearer=1.0):
+        turn = rotation.from_axis_angle(torch.tensor([0.0, 1.0, 0.0]), torch.tensor(math.radians(degrees)))
+        center = middle + nearer * turn @ (camera_center(source.viewmat) - middle)
+        viewmat = torch.cat([torch.cat([turn.T, -(turn.T @ center)[:, None]], 1), source.viewmat[3:]])
+        camera = source._replace(viewmat=viewmat)
+        seen = [avatar.pose(avatar.source_pose, camera=camera).colors for avatar in (plain, dark)]
+        return float((seen[1] / seen[0]).median())
+
+    assert ratio(0) == pytest.approx(0.5, abs=1e-3) and ratio(0, nearer=3) == pytest.approx(0.5, abs=1e-3)
+    assert ratio(-22) == pytest.approx(ratio(22), abs=1e-3) and 0.6 < ratio(22) < 0.9
+    assert ratio(40) == ratio(180) == 1
+    assert torch.equal(dark.pose(dark.source_pose).colors, dark.pose(dark.source_pose, camera=source).colors)
+
+
+def test_many_poses_have_each_their_share_of_the_shade_that_a_camera_sees(hand, scene):
+    crop, truth, pose = scene
+    facing = posed_lighting(crop.rest.vertices, crop.posed.vertices, hand.faces, EVEN).normals
+    shaded = EVEN._replace(shade=torch.full_like(facing, 0.5), facing=facing)
+    avatar = avatar_of(hand, truth, pose, crop.camera, shaded)
+    moved = pose._replace(translation=pose.translation + torch.tensor([0.2, 0.0, 0.0]))
+    both = type(pose)(*(torch.stack(parts) for parts in zip(pose, moved, strict=True)))
+    together = avatar.pose(both, camera=crop.camera).colors
+    for own, each in zip(together, (pose, moved), strict=True):
+        torch.testing.assert_close(own, avatar.pose(each, camera=crop.camera).colors)
+    assert float((together[1] - together[0]).abs().mean()) > 0.05

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, max_pool2d, normalize
 
 from oasis_warp.core import surface
+from oasis_warp.core.camera import camera_center
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import HandCrop, TrainingBatch
 from oasis_warp.ops import depth_visibility
@@ -106,8 +107,7 @@ def facing(
     vertices: Float[Tensor, "*B V 3"], normals: Float[Tensor, "*B V 3"], viewmat: Float[Tensor, "*B 4 4"]
 ) -> Float[Tensor, "*B V"]:
     """Cosine between each vertex's normal and its direction to the camera: negative where it turns away."""
-    center = -viewmat[..., :3, :3].mT @ viewmat[..., :3, 3:]
-    return (normals * normalize(center.mT - vertices, dim=-1)).sum(-1)
+    return (normals * normalize(camera_center(viewmat)[..., None, :] - vertices, dim=-1)).sum(-1)
 
 
 def inner_mask(mask: Float[Tensor, "*B H W"], pixels: int = RIM_PIXELS) -> Float[Tensor, "*B H W"]:

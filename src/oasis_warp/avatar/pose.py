@@ -30,6 +30,10 @@ err by .05; a finger that lies on the palm hides .5 and more."""
 SAME_BESIDE, OTHER_BESIDE = 0.02, 0.08
 """The same where the photo may show another part of the hand: what it showed there goes as soon as that part moves.
 Set by eye on the print of a finger tip, half straightened, in one photo of tests/data/photos/same_hand."""
+SAME_VIEW, OTHER_VIEW = math.cos(math.radians(10)), math.cos(math.radians(35))
+"""Cosines of the angle between the directions from which photo and picture see the hand, up to which shade stays and
+from which it is gone: seen from another side, what a photo shows on a slant, in gloss or a pixel off is a stain. Chosen
+on 24 hands of same_hand from 45 degrees on, as docs/looks.md says."""
 WEAK, DEEP = 0.3, 0.6
 """Differences of shade from 1 up to which it is relief or tone of the skin itself, and from which it is a sharp shadow,
 gloss, or another part of the hand. Set by eye on one thumb-up photo with gashes, creases and a red spot."""
@@ -52,6 +56,8 @@ class SurfaceLight(NamedTuple):
     """Share of the sky that each vertex saw in the photo; None where no shade depends on it."""
     end: Int[Tensor, "E"] | None = None
     """The Gaussians on the wrist's rim, which close it: light falls on them by their own normals."""
+    photo_view: Float[Tensor, "3"] | None = None
+    """Unit direction from the middle of the hand to the photo's camera; None where the view changes no colour."""
 
 
 class Lighting(NamedTuple):
@@ -85,18 +91,33 @@ def with_photo(
     photo: Float[Tensor, "V 3"],
     faces: Int[Tensor, "F 3"],
     canonical: CanonicalGaussians | None = None,
+    center: Float[Tensor, "3"] | None = None,
 ) -> SurfaceLight:
     """`light` on a surface, given its vertices at rest and in the photo that the light's shade is of.
 
-    With the Gaussians, if those on the wrist's rim close it.
+    With the Gaussians, if those on the wrist's rim close it. With the `center` of the photo's camera, for pictures from
+    other sides.
     """
     normals, end = surface.vertex_normals(rest, faces), None
     if canonical is not None:
         end = torch.nonzero(surface.open_vertices(faces, len(rest))[canonical.vertex_index])[:, 0]
-    if light.albedo is None or light.shade is None:
+    if light.facing is None:
         return SurfaceLight(light, normals, end=end)
+    view = None if center is None else view_direction(photo, center)
+    if light.albedo is None or light.shade is None:
+        return SurfaceLight(light, normals, None, end, view)
     seen = posed_lighting(rest, photo, faces, light).exposure
-    return SurfaceLight(light, normals, None if seen is None else seen[..., 0], end)
+    return SurfaceLight(light, normals, None if seen is None else seen[..., 0], end, view)
+
+
+def view_direction(vertices: Float[Tensor, "*B V 3"], center: Float[Tensor, "3"]) -> Float[Tensor, "*B 3"]:
+    """Unit direction from the middle of the posed hand to a camera at `center`."""
+    return torch.nn.functional.normalize(center - vertices.mean(-2), dim=-1)
+
+
+def view_share(photo_view: Float[Tensor, "3"], view: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B"]:
+    """Share of the photo's shade that stays in a picture of the hand from this direction."""
+    return (((photo_view * view).sum(-1) - OTHER_VIEW) / (SAME_VIEW - OTHER_VIEW)).clamp(0, 1)
 
 
 def with_self_occlusion(
@@ -159,12 +180,18 @@ def shading_factors(
     light: HandLight,
     on: Lighting,
     seen: Float[Tensor, "V"] | None = None,
+    viewed: Float[Tensor, "*B"] | None = None,
 ) -> Float[Tensor, "*B N 3"]:
-    """Factors by which `light` multiplies the colours of Gaussians; without `seen` those in the photo itself."""
+    """Factors by which `light` multiplies the colours of Gaussians.
+
+    Without `seen` those in the photo itself; `viewed` is the `view_share`, 1 if not given.
+    """
     of_vertices = shading(light, on)
     if light.facing is None:
         return _at_gaussians(of_vertices, faces, canonical)
     stays = remaining_shade(light, on, seen)
+    if viewed is not None:
+        stays = stays * viewed[..., None, None]
     if light.shade is not None:  # all of it is smooth, or of pixels beside outlines
         of_vertices = of_vertices * (1 + stays[..., :1] * (light.shade - 1))
     if canonical.shade is None:
@@ -254,6 +281,7 @@ def pose_gaussians(
     rest_vertices: Float[Tensor, "V 3"] | RestMesh,
     posed_vertices: Float[Tensor, "*B V 3"],
     light: SurfaceLight | None = None,
+    center: Float[Tensor, "3"] | None = None,
 ) -> Gaussians:
     """Gaussians that follow the surface from `rest_vertices` to `posed_vertices` (the paper's appendix B.1).
 
@@ -261,7 +289,8 @@ def pose_gaussians(
     of the face's area. Vertex Gaussians rotate with their vertex and scale with the faces around it together. Values
     are not checked here: the caller has checked the pose. A surface that is posed many times is given as its
     `rest_mesh`. If `posed_vertices` have a leading axis of poses, so have means, quats and scales. With a `light`, so
-    have the colours: they are drawn in it, without the part that the posed surface hides.
+    have the colours: they are drawn in it, without the part that the posed surface hides. With the `center` of a
+    camera, shade fades as that camera leaves the side of the photo; without, it is as the photo's camera saw it.
     """
     means, quats, scales, vertex_quats = pose_mesh_gaussians(
         rest_vertices, posed_vertices, faces, canonical.face_index, canonical.barycentrics, canonical.vertex_index,
@@ -270,7 +299,10 @@ def pose_gaussians(
     colors = canonical.colors
     if light is not None and vertex_quats is not None:
         on = lighting(posed_vertices, vertex_quats, light.normals, light.light)
-        factors = shading_factors(canonical, faces, light.light, on, light.seen)
+        viewed = None
+        if center is not None and light.photo_view is not None:
+            viewed = view_share(light.photo_view, view_direction(posed_vertices, center))
+        factors = shading_factors(canonical, faces, light.light, on, light.seen, viewed)
         if light.end is not None:
             factors = factors.index_copy(-2, light.end, _end_factors(canonical, quats, light.light, on, light.end))
         colors = (colors * factors).clamp(0, 1)

@@ -46,15 +46,15 @@ def draw_frames(
 ) -> Iterator[UInt8[Tensor, "H W C"]]:
     """A frame for each of the `cameras` and of the poses of every hand; transparent without a `background`.
 
-    Nothing is posed again while every hand keeps its pose.
+    Nothing is posed again while every hand keeps its pose and camera.
     """
     color = BLACK if background is None else background
     last, gaussians = None, None
     for frame, camera in enumerate(cameras):
-        poses = [own[frame] for _, own in hands]
-        if last is None or any(one is not other for one, other in zip(poses, last, strict=True)):
-            posed = [avatar.pose(pose) for (avatar, _), pose in zip(hands, poses, strict=True)]
-            last, gaussians = poses, Gaussians(*map(torch.cat, zip(*posed, strict=True)))
+        shown = [camera, *(own[frame] for _, own in hands)]
+        if last is None or any(one is not other for one, other in zip(shown, last, strict=True)):
+            posed = [avatar.pose(poses[frame], camera=camera) for avatar, poses in hands]
+            last, gaussians = shown, Gaussians(*map(torch.cat, zip(*posed, strict=True)))
         assert gaussians is not None
         drawn = render(gaussians, camera, background=color)
         yield to_uint8(drawn.image if background is not None else straight_alpha(drawn))

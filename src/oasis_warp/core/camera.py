@@ -16,6 +16,11 @@ def project(camera: Camera, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor,
     return image[:, :2] / image[:, 2:], local[:, 2]
 
 
+def camera_center(viewmat: Float[Tensor, "*B 4 4"]) -> Float[Tensor, "*B 3"]:
+    """Where in the world the camera is [m]."""
+    return -(viewmat[..., :3, :3].mT @ viewmat[..., :3, 3:])[..., 0]
+
+
 ORBIT_FIELD_OF_VIEW = math.radians(30)
 ORBIT_MARGIN = 1.08
 """Distance of the camera, in units of the distance at which the hand's bounding sphere just fills the picture."""
@@ -31,9 +36,7 @@ def crop_camera(camera: Camera, left: float, top: float, side: float, size: int)
     return Camera(camera.viewmat, K, size, size)
 
 
-def orbit_camera(
-    vertices: Float[Tensor, "V 3"], azimuth: float, elevation: float = 0.0, size: int = 256
-) -> Camera:
+def orbit_camera(vertices: Float[Tensor, "V 3"], azimuth: float, elevation: float = 0.0, size: int = 256) -> Camera:
     """A camera that looks at the middle of `vertices` from any side and frames all of them.
 
     At `azimuth` 0 and `elevation` 0 [rad] it looks along the world's z axis with y down, as the camera of a fitted

@@ -22,6 +22,7 @@ from torch import Tensor
 from oasis_warp import __version__
 from oasis_warp.avatar.pose import pose_gaussians, rotate_light, with_photo
 from oasis_warp.avatar.prior import Prior
+from oasis_warp.core.camera import camera_center
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent
@@ -232,9 +233,7 @@ def draw_methods(
 ) -> Iterator[tuple[Method, list[Tensor]]]:
     """The result of each method from the one photo of `batch`, drawn in the pose and view of each target."""
     methods = available_methods(setup.priors, setup.config)
-    for method, made in reconstructions(
-        bundled_hand(), crop_of(batch), setup.priors, methods, setup.config.adapt
-    ):
+    for method, made in reconstructions(bundled_hand(), crop_of(batch), setup.priors, methods, setup.config.adapt):
         yield method, draw_targets(made, hand, batch, rotations)
 
 
@@ -253,9 +252,10 @@ def draw_targets(
         if made.light is None or rotations is None:
             posed_gaussians = pose_gaussians(made.without_light(), hand.faces, rest, posed)
         else:
-            light = rotate_light(made.light, rotations[k].to(rest))
-            light = with_photo(light, rest, batch.posed[0], hand.faces, made.gaussians)
-            posed_gaussians = pose_gaussians(made.gaussians, hand.faces, rest, posed, light)
+            turn = rotations[k].to(rest)
+            photo, seen_from = batch.posed[0] @ turn.T, turn @ camera_center(batch.viewmat[0])
+            light = with_photo(rotate_light(made.light, turn), rest, photo, hand.faces, made.gaussians, seen_from)
+            posed_gaussians = pose_gaussians(made.gaussians, hand.faces, rest, posed, light, camera_center(viewmat))
         images.append(render(posed_gaussians, Camera(viewmat, K, size, size)).image)
     return images
 

@@ -104,6 +104,7 @@ def page_facts(
         "motions": [{"label": "Through poses", "seconds": WALK_SECONDS, "frames": [_flat(frame) for frame in walk]}],
         "joints": joint_sliders(parts.hand),
         "lights": {name: _light_facts(light) for name, light in lights.items()},
+        "photoView": None if studio.photo_view is None else _flat(studio.photo_view),
         "still": sky_mesh(torch.device("cpu")).still,
         "orbitMargin": ORBIT_MARGIN,
         "fieldOfView": ORBIT_FIELD_OF_VIEW,

@@ -5,6 +5,7 @@
 const GAMMA = 2.2; // light is sRGB to this power, nearly
 const AS_IN_PHOTO = Math.cos((5 * Math.PI) / 180), TURNED_AWAY = Math.cos((20 * Math.PI) / 180);
 const SAME_POSE = 0.9, OTHER_POSE = 0.5; // shares of the hand that face as in the photo
+const SAME_VIEW = Math.cos((10 * Math.PI) / 180), OTHER_VIEW = Math.cos((35 * Math.PI) / 180);
 const SAME_SKY = 0.08, OTHER_SKY = 0.25; // changes of the share of the sky that skin sees, as in avatar/pose.py
 const SAME_BESIDE = 0.02, OTHER_BESIDE = 0.08; // the same where the photo is in doubt
 const THROUGH_SKIN = [0.15, 0.07, 0.04]; // light that reaches skin which sees no sky, as in avatar/sky.py
@@ -30,16 +31,30 @@ function makeShading(body, gaussians) {
 
 const between = (x, low, high) => Math.min(Math.max((x - low) / (high - low), 0), 1);
 
+// What the posed hand hides of a light, and what no longer hides the sky as in the photo.
+function hideLight(body, { normals, sky, change, nearby }, { harmonics, albedo, seen }, hurry) {
+  if (!albedo) return;
+  exposeVertices(body, sky, normals, harmonics, hurry);
+  if (!seen) return;
+  for (let v = 0; v < body.nVertices; v++) change[v] = Math.max(sky.exposure[4 * v] - seen[v], 0); // what cast the shade has moved
+  largestNearby(body, sky, change, nearby);
+}
+
+// Share of the photo's shade that stays in a picture from `eye`.
+function viewShare({ data, posed, nVertices }, eye) {
+  const { photoView } = data;
+  if (!photoView) return 1;
+  const middle = [0, 0, 0];
+  for (let i = 0; i < 3 * nVertices; i++) middle[i % 3] += posed[i] / nVertices;
+  const toward = eye.map((x, k) => x - middle[k]), along = toward[0] * photoView[0] + toward[1] * photoView[1] + toward[2] * photoView[2];
+  return between(along / Math.hypot(...toward), OTHER_VIEW, SAME_VIEW);
+}
+
 // Factors of the colours of every vertex and the share of the photo's weak shade that is left, into shading.factors; that
 // of deep shade into shading.deep: for it, and where the photo is in doubt, the change of the sky is the largest nearby.
-// Deep shade also ends with the photo's pose, on all of the hand at once.
-function lightVertices(body, shading, light, hurry = false) {
-  const { shade, facing, doubt } = body.data.arrays, { normals, factors, sky, change, nearby, deep, ends } = shading, { harmonics, albedo, seen } = light;
-  if (albedo) exposeVertices(body, sky, normals, harmonics, hurry);
-  if (albedo && seen) {
-    for (let v = 0; v < body.nVertices; v++) change[v] = Math.max(sky.exposure[4 * v] - seen[v], 0); // what cast the shade has moved
-    largestNearby(body, sky, change, nearby);
-  }
+// Deep shade also ends with the photo's pose, on all of the hand at once. Of both the share `viewed` is seen.
+function lightVertices(body, shading, light, viewed) {
+  const { shade, facing, doubt } = body.data.arrays, { normals, factors, sky, change, nearby, deep, ends } = shading, { albedo, seen } = light;
   const bounce = albedo && albedo.map((a) => [2.0404 * a - 0.3324, -4.7951 * a + 0.6417, 2.7552 * a + 0.6903]);
   const keptAt = (v) => {
     const a = 3 * v;
@@ -53,7 +68,7 @@ function lightVertices(body, shading, light, hurry = false) {
     const x = normals[3 * v], y = normals[3 * v + 1], z = normals[3 * v + 2], kept = keptAt(v);
     const unsure = doubt ? doubt[v] : 0, mixed = (sure, beside) => sure + unsure * (beside - sure);
     const same = mixed(SAME_SKY, SAME_BESIDE), other = mixed(OTHER_SKY, OTHER_BESIDE);
-    const left = (moved) => (albedo && seen ? kept * (1 - between(moved, same, other)) : kept);
+    const left = (moved) => viewed * (albedo && seen ? kept * (1 - between(moved, same, other)) : kept);
     deep[v] = held * left(nearby[v]);
     lightPlace(light, bounce, x, y, z, sky.exposure, 4 * v, factors, 4 * v);
     if (shade) for (let c = 0; c < 3; c++) factors[4 * v + c] *= 1 + deep[v] * (shade[3 * v + c] - 1);

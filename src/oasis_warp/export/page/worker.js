@@ -9,7 +9,7 @@ async function openHand(base64) {
   for (const light of Object.values(data.lights)) light.seen = light.albedo ? data.arrays.seen : null;
   const body = makeBody(data), gaussians = makeGaussians(body);
   return {
-    body, gaussians, shading: makeShading(body, gaussians), projection: makeProjection(gaussians), angles: "", look: "",
+    body, gaussians, shading: makeShading(body, gaussians), projection: makeProjection(gaussians), angles: "", look: "", viewed: 1,
     partly: false, // whether a hurry left something out of the pose
     skips: false, // whether it left out the colours
   };
@@ -24,10 +24,11 @@ function poseHand({ body, shading }, angles) {
 }
 
 // In even light and on the map colours do not depend on the pose.
-function paintHand({ body, gaussians, shading }, look, hurry) {
+function paintHand({ body, gaussians, shading }, look, viewed, posed, hurry) {
   if (look === "map") return mapGaussians(body, gaussians, shading);
   const light = body.data.lights[look] ?? null;
-  if (light) lightVertices(body, shading, light, hurry);
+  if (light && posed) hideLight(body, shading, light, hurry);
+  if (light) lightVertices(body, shading, light, viewed);
   return colorGaussians(body, gaussians, shading, light);
 }
 
@@ -45,8 +46,9 @@ function drawHand(hand, wish) {
   markShown(body, gaussians, shading.normals, view.eye, partly && facing);
   if (moved || hand.partly) poseGaussians(body, gaussians);
   const same = partly && look === hand.look, skips = same && hand.partly && !hand.skips;
-  if ((moved || hand.partly || look !== hand.look) && !skips) paintHand(hand, look, same);
-  Object.assign(hand, { angles: key, look, partly, skips });
+  const relit = moved || hand.partly || look !== hand.look, viewed = viewShare(body, view.eye);
+  if ((relit || viewed !== hand.viewed) && !skips) paintHand(hand, look, viewed, relit, same);
+  Object.assign(hand, { angles: key, look, viewed: skips ? hand.viewed : viewed, partly, skips });
   if (hurry && facing && !partly) markShown(body, gaussians, shading.normals, view.eye, true);
   const count = projectGaussians(gaussians, projection, view);
   return { ellipses: sortEllipses(projection, shading.colors, count), count };
