@@ -44,7 +44,7 @@ _FIST: dict[str, Finger] = {
 _THUMBS: dict[str, Thumb] = {
     "open": (-10, 14, 0, 0, 0),
     "relaxed": (8, -4, 0, 14, 16),
-    "fist": (22, 15, -11, 40, 47),
+    "fist": (25, 15, -10, 28, 73),
     "pinch": (35, 10, -10, 2, 5),
     "thumbs_up": (-12, 18, 0, 0, -6),
     "victory": (38, 21, -16, 40, 45),
