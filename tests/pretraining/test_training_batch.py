@@ -264,22 +264,28 @@ def network():
     return DenseNetwork()
 
 
-def test_the_truth_has_no_loss_but_its_own_uncertainty(batch):
-    """A head compared with another field, or a field in another unit, would leave a loss."""
-    sure = -6.0
-    predicted = DensePrediction(
+SURE = -6.0
+"""Logarithm of the scale that `truth_of` predicts."""
+
+
+def truth_of(batch):
+    return DensePrediction(
         classes=(batch.classes + 1e-9).log(),
         surface=batch.surface,
-        log_scale=torch.full_like(batch.surface[:, 0], sure),
+        log_scale=torch.full_like(batch.surface[:, 0], SURE),
         normal=batch.normal,
         albedo=srgb(batch.albedo),
         finger=50 * torch.nn.functional.one_hot(batch.finger, HEADS["finger"]).permute(0, 3, 1, 2).float(),
     )
-    terms = dense_loss(predicted, batch)
+
+
+def test_the_truth_has_no_loss_but_its_own_uncertainty(batch):
+    """A head compared with another field, or a field in another unit, would leave a loss."""
+    terms = dense_loss(truth_of(batch), batch)
     entropy = -(batch.classes * (batch.classes + 1e-9).log()).sum(1).mean()
     assert terms["classes"] == pytest.approx(float(entropy), abs=1e-4)
-    assert terms["surface"] == pytest.approx(3 * sure, abs=1e-4)
-    for name in ("normal", "albedo", "edges", "finger"):
+    assert terms["surface"] == pytest.approx(3 * SURE, abs=1e-4)
+    for name in ("normal", "albedo", "edges", "contrast", "finger"):
         assert abs(float(terms[name])) < 1e-5, name
 
 
@@ -356,3 +362,8 @@ def test_weights_survive_a_file_and_damaged_files_are_refused(tmp_path):
         path.write_bytes(damage)
         with pytest.raises(InputError, match="dense"):
             load_dense_network(path)
+
+
+def test_a_mean_of_the_albedo_costs_its_missing_contrast(batch):
+    blurred = torch.nn.functional.avg_pool2d(srgb(batch.albedo), 9, 1, 4)
+    assert dense_loss(truth_of(batch)._replace(albedo=blurred), batch)["contrast"] > 0.3

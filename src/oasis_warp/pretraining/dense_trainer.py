@@ -27,8 +27,16 @@ from oasis_warp.synthetic.dense_pictures import DenseBatch, moved, render_dense
 from oasis_warp.synthetic.sensor import srgb
 from oasis_warp.synthetic.shots import SceneConfig, sample_tables_ahead
 
-WEIGHTS = {"classes": 1.0, "surface": 0.3, "normal": 0.5, "albedo": 2.0, "edges": 1.0, "finger": 0.1}
+WEIGHTS = {
+    "classes": 1.0, "surface": 0.3, "normal": 0.5, "albedo": 2.0, "edges": 1.0, "contrast": 0.03, "finger": 0.1,
+}  # fmt: skip
 """Weights of the terms of the loss."""
+SIGMAS = (1.0, 2.0, 4.0, 8.0)
+"""Standard deviations of the Gaussians between the bands of the term `contrast` [px]."""
+LEAST_CONTRAST, DARKEST = 1e-3, 0.02
+"""Least contrast of a band that counts, and the darkest albedo, encoded as sRGB."""
+FEWEST = 400
+"""Pixels of skin below which a photo's contrast does not count."""
 MILLIMETRES = 1e3 * SURFACE_UNIT
 
 
@@ -72,7 +80,8 @@ def dense_loss(predicted: DensePrediction, true: DenseBatch) -> dict[str, Tensor
 
     classes, finger: cross-entropy. surface: negative log-likelihood of a Laplace distribution with the predicted
     scale. normal: 1 - cosine. albedo: absolute difference in the encoding of sRGB; edges: the same of the differences
-    between neighbours, so that lines of the skin stay sharp.
+    between neighbours, so that lines of the skin stay sharp. contrast: absolute difference of the logarithms of the
+    albedo's contrast in four bands of each photo; without it the network would give a mean, which has less.
     """
     skin, albedo = true.skin.float(), srgb(true.albedo)
     count = skin.sum().clamp_min(1)
@@ -89,8 +98,32 @@ def dense_loss(predicted: DensePrediction, true: DenseBatch) -> dict[str, Tensor
         "normal": on_skin(1 - (predicted.normal * true.normal).sum(1)),
         "albedo": on_skin(difference.abs().mean(1)),
         "edges": (slopes[0].sum() + slopes[1].sum()) / count,
+        "contrast": _contrast_gap(predicted.albedo, albedo, skin),
         "finger": on_skin(cross_entropy(predicted.finger, true.finger, reduction="none")),
     }
+
+
+def _contrast_gap(predicted: Float[Tensor, "B 3 H W"], true: Tensor, skin: Float[Tensor, "B H W"]) -> Tensor:
+    contrasts = [_contrasts(values.clamp_min(DARKEST).log().mean(1), skin) for values in (predicted, true)]
+    first, second = (values.clamp_min(LEAST_CONTRAST).log() for values in contrasts)
+    counts = (skin.sum((1, 2)) >= FEWEST).float()[:, None]
+    return ((first - second).abs() * counts).sum() / (counts.sum() * len(SIGMAS)).clamp_min(1)
+
+
+def _contrasts(values: Float[Tensor, "B H W"], skin: Float[Tensor, "B H W"]) -> Float[Tensor, "B 4"]:
+    """Mean magnitude of the differences of Gaussians on the skin; what lies beside it adds nothing."""
+    levels = [values]
+    for sigma in SIGMAS:
+        rows, columns = (_gaussian(n, sigma, values) for n in values.shape[1:])
+        levels.append((rows @ (values * skin) @ columns) / (rows @ skin @ columns).clamp_min(1e-6))
+    bands = torch.stack([fine - coarse for fine, coarse in itertools.pairwise(levels)], 1)
+    return (bands.abs() * skin[:, None]).sum((2, 3)) / skin.sum((1, 2)).clamp_min(1)[:, None]
+
+
+def _gaussian(size: int, sigma: float, like: Tensor) -> Float[Tensor, "n n"]:
+    """Weights of a Gaussian from each pixel of a line to each other."""
+    x = torch.arange(size, device=like.device, dtype=like.dtype)
+    return torch.exp(-0.5 * ((x[:, None] - x) / sigma) ** 2)
 
 
 def _neighbours(values: Tensor, axis: int) -> tuple[Tensor, Tensor]:

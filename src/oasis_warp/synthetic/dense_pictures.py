@@ -1,5 +1,6 @@
 """Synthetic photos of right hands with the truth of every pixel: class, surface point, normal, albedo, finger."""
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -7,9 +8,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import affine_grid, avg_pool2d, grid_sample
 
+from oasis_warp.core.color import linear_light
 from oasis_warp.synthetic.body import FINGERS, body_on, device_name
 from oasis_warp.synthetic.disturbances import disturb
 from oasis_warp.synthetic.picture import SAMPLES, ShadedBatch, scene_light, shade_batch, take_photo
+from oasis_warp.synthetic.sensor import srgb
 from oasis_warp.synthetic.shots import SceneConfig, ShotTable
 
 UNIT = 0.1
@@ -17,6 +20,12 @@ UNIT = 0.1
 FINGER_ORDER = tuple(FINGERS.index(name) for name in ("thumb", "index", "middle", "ring", "little"))
 EXPOSURE_JITTER = 0.35
 """Standard deviation of the logarithm of each photo's exposure, beside the sensor's own."""
+GLOSSY, DIM = 0.3, 0.3
+"""Shares of moved photos whose skin shines, and that are darker and greyer."""
+GLOSS, GLOSS_POWERS = (0.03, 0.4), (3.0, 30.0)
+"""Ranges of the gloss, in linear light, and of the exponent of its lobe."""
+DIM_POWER, DIM_GREY = 0.8, 0.6
+"""Largest rise of the logarithm of a dim photo's exponent, and share of its saturation that goes."""
 MIN_SKIN = 0.6
 """Share of a pixel that must be visible bare skin for its surface point to count."""
 
@@ -103,10 +112,34 @@ def _with_ground_truth(batch: ShadedBatch, image: Tensor, front: Tensor) -> Dens
     )
 
 
+def _shining(batch: DenseBatch, random: torch.Generator) -> Float[Tensor, "B 3 H W"]:
+    """The photos, some of them with one broad highlight on the skin, as dark skin has beside a window."""
+    count, device = len(batch.image), batch.image.device
+
+    def between(low: float, high: float) -> Tensor:
+        return low + (high - low) * torch.rand(count, 1, 1, 1, generator=random, device=device)
+
+    toward = torch.randn(count, 3, 1, 1, generator=random, device=device)
+    toward = torch.nn.functional.normalize(torch.cat([toward[:, :2], -toward[:, 2:].abs()], 1), dim=1)
+    # to the edge of the skin, whose outermost pixels have no normals
+    skin = batch.skin[:, None].float()
+    near = avg_pool2d(torch.cat([batch.normal * skin, skin], 1), 5, 1, 2)
+    normal = torch.nn.functional.normalize(near[:, :3], dim=1)
+    lobe = (normal * toward).sum(1, keepdim=True).clamp_min(0) ** between(*map(math.log, GLOSS_POWERS)).exp()
+    strength = between(*map(math.log, GLOSS)).exp() * (between(0.0, 1.0) < GLOSSY)
+    tint = 1 + 0.1 * torch.randn(count, 3, 1, 1, generator=random, device=device)
+    share = batch.classes[:, 1:2] * (near[:, 3:] > 0)
+    return srgb(
+        (linear_light(batch.image.movedim(1, -1)).movedim(-1, 1) + share * strength * tint.clamp_min(0) * lobe).clamp(
+            0, 1
+        )
+    )
+
+
 def moved(batch: DenseBatch, random: torch.Generator) -> DenseBatch:
     """The same photos rotated, scaled, shifted, and in other colours; what comes in is black or of one colour.
 
-    A photo takes long to render, so training shows each one again like this.
+    A photo takes long to render, so training shows each one again like this. Some of them shine, and some are dim.
     """
     count, size = len(batch.image), batch.image.shape[-1]
 
@@ -128,7 +161,9 @@ def moved(batch: DenseBatch, random: torch.Generator) -> DenseBatch:
 
     border = uniform(count, 3, 1, 1, low=0.0, high=1.0) * (uniform(count, 1, 1, 1, low=-1.0, high=1.0) > 0)
     power, gain = normal(count, 1, 1, 1, sigma=0.2).exp(), normal(count, 3, 1, 1, sigma=0.12).exp()
-    image = ((sample(batch.image - border) + border).clamp(0, 1) ** power * gain).clamp(0, 1)
+    image = ((sample(_shining(batch, random) - border) + border).clamp(0, 1) ** power * gain).clamp(0, 1)
+    dim = (uniform(count, 1, 1, 1, low=0.0, high=1.0) < DIM) * uniform(2, count, 1, 1, 1, low=0.0, high=1.0)
+    image = torch.lerp(image, image.mean(1, keepdim=True), DIM_GREY * dim[0]) ** (DIM_POWER * dim[1]).exp()
     classes, albedo, inside = sample(
         torch.cat([batch.classes, batch.albedo, torch.ones_like(batch.albedo[:, :1])], 1)
     ).split([4, 3, 1], 1)
