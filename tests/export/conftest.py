@@ -3,6 +3,7 @@ import torch
 from synthetic import as_left_hand, avatar_of, crop_of
 
 from oasis_warp.avatar.appearance import label_regions, region_colors
+from oasis_warp.core import surface
 from oasis_warp.core.types import HandLight
 from oasis_warp.export import texture
 
@@ -24,6 +25,16 @@ def left_hand(right_hand):
 @pytest.fixture(params=["left", "right"])
 def avatar(request, left_hand, right_hand):
     return {"left": left_hand, "right": right_hand}[request.param]
+
+
+@pytest.fixture
+def shaded(avatar):
+    """The same with a shade that only the photo's side sees."""
+    light, gaussians = avatar.light, avatar.gaussians
+    facing = surface.vertex_normals(avatar._photo_surface(), avatar.hand.faces)
+    shade = torch.linspace(0.4, 1.5, len(facing))[:, None].expand(-1, 3)
+    own = torch.linspace(0.5, 1.3, len(gaussians.colors))[:, None].expand(-1, 3)
+    return avatar.with_looks(gaussians._replace(shade=own), light._replace(shade=shade, facing=facing))
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -21,7 +21,6 @@ from synthetic import avatar_of, crop_of
 from oasis_kernels import constants
 from oasis_warp.avatar import pose
 from oasis_warp.avatar.sky import studio_light
-from oasis_warp.core import surface
 from oasis_warp.core.camera import ORBIT_FIELD_OF_VIEW, orbit_camera
 from oasis_warp.data.splat_files import read_splats
 from oasis_warp.export import export_avatar
@@ -253,12 +252,7 @@ def test_the_pages_script_poses_and_lights_as_python_does(avatar, pages, tmp_pat
 
 @pytest.mark.slow
 @pytest.mark.skipif(NODE is None, reason="needs node")
-def test_the_pages_script_fades_shade_as_python_does_when_the_camera_leaves(avatar, tmp_path):
-    light, gaussians = avatar.light, avatar.gaussians
-    facing = surface.vertex_normals(avatar._photo_surface(), avatar.hand.faces)
-    shade = torch.linspace(0.4, 1.5, len(facing))[:, None].expand(-1, 3)
-    own = torch.linspace(0.5, 1.3, len(gaussians.colors))[:, None].expand(-1, 3)
-    shaded = avatar.with_looks(gaussians._replace(shade=own), light._replace(shade=shade, facing=facing))
+def test_the_pages_script_fades_shade_as_python_does_when_the_camera_leaves(shaded, tmp_path):
     jobs = [{"pose": "photo", "look": "photo", "azimuth": angle} for angle in (0.0, 0.35, -0.5, 1.0, 0.35)]
     run_script(page_html(shaded, "A hand"), jobs, tmp_path)
     colors = []

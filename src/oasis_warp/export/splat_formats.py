@@ -26,7 +26,7 @@ from oasis_warp.data.output_files import write_file
 from oasis_warp.data.splat_files import SH_C0, SPLAT_ROW, SPZ4_HEADER, SPZ_COLOR_SCALE, SPZ_MAGIC, zstandard
 from oasis_warp.export.request import ExportRequest
 from oasis_warp.export.skinned_gltf import VERTICES, GltfBuffer, write_gltf
-from oasis_warp.export.splats import largest_component, morton_order, posed_splats, y_down
+from oasis_warp.export.splats import largest_component, morton_order, posed_splats, view_harmonics, y_down
 
 MIN_OPACITY = 1e-6
 """Distance of opacities from 0 and 1, where their logits end."""
@@ -39,19 +39,23 @@ PLY_COLUMNS = (
 def write_ply(request: ExportRequest, path: Path) -> None:
     """One float32 row a Gaussian: log scales, logit opacities, wxyz; y down and z forward, as trained scenes have it.
 
-    Colours are the constant harmonic of sRGB; no others, as the avatar's colours do not depend on the view.
+    Colours are the constant harmonic of sRGB, and 15 more where they depend on the view.
 
     Raises:
         InputError: a value is not finite, or `path` cannot be written.
     """
-    splats = y_down(posed_splats(request))
+    splats, harmonics = y_down(posed_splats(request)), view_harmonics(request)
     opacities = splats.opacities.clamp(MIN_OPACITY, 1 - MIN_OPACITY).logit()
+    if harmonics is None:
+        harmonics = (splats.colors[:, None] - 0.5) / SH_C0
+    rest = harmonics[:, 1:].mT.flatten(1)  # those of red first
     parts = (
-        splats.means, torch.zeros_like(splats.means), (splats.colors - 0.5) / SH_C0, opacities[:, None],
-        splats.scales.log(), splats.quats,
+        splats.means, torch.zeros_like(splats.means), harmonics[:, 0], rest, opacities[:, None], splats.scales.log(),
+        splats.quats,
     )  # fmt: skip
+    columns = (*PLY_COLUMNS[:9], *(f"f_rest_{k}" for k in range(rest.shape[1])), *PLY_COLUMNS[9:])
     rows = torch.cat(parts, 1).numpy().astype("<f4")
-    write_file(path, ply_header(("vertex", len(rows), "float", PLY_COLUMNS)) + np.ascontiguousarray(rows).tobytes())
+    write_file(path, ply_header(("vertex", len(rows), "float", columns)) + np.ascontiguousarray(rows).tobytes())
 
 
 def ply_header(*elements: tuple[str, int, str, tuple[str, ...]]) -> bytes:

@@ -5,13 +5,16 @@ from collections.abc import Iterable
 import numpy as np
 import torch
 from jaxtyping import Float
+from numpy.polynomial import Chebyshev, Polynomial, legendre
 from torch import Tensor
 
 from oasis_warp.core import rotation
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import logger
 from oasis_warp.core.types import Camera, Gaussians
+from oasis_warp.data.splat_files import SH_C0
 from oasis_warp.export.request import ExportRequest
+from oasis_warp.ops import spherical_harmonics
 
 MIN_SCALE, MAX_SCALE = 1e-6, 0.02
 """Standard deviations that leave [m]: thinner than any skin, wider than a finger. Viewers hang on huge ones."""
@@ -30,6 +33,47 @@ def posed_splats(request: ExportRequest) -> Gaussians:
     shown = avatar.in_even_light() if request.light == "none" else avatar
     to_photo, wrist = photo_axes(avatar.source_camera), avatar.mesh(pose).joints[0]
     return checked(moved(shown.pose(pose), to_photo, wrist))
+
+
+SIDE_LOBES = 0.15
+"""Largest share of the photo's shade beyond the main lobe."""
+DEGREE = 3
+"""Highest degree of spherical harmonics that viewers draw."""
+
+
+@torch.no_grad()
+def view_harmonics(request: ExportRequest) -> Float[Tensor, "N K 3"] | None:
+    """Spherical harmonics of the colours of `posed_splats`, in axes of `y_down`; None where no view changes them.
+
+    From the photo's side they have the photo's shade, from others they have not (`avatar.pose.view_share`). The share
+    is the polynomial of degree 3 of the cosine with the narrowest lobe (Dolph and Chebyshev): 1 at the photo's side, a
+    half at 32 degrees, and at most `SIDE_LOBES` from 48 degrees on.
+    """
+    avatar, light, pose = request.avatar, request.avatar.parts.light, request.pose or request.avatar.source_pose
+    if request.light == "none" or light is None or light.photo_view is None:
+        return None
+    axes, middle = torch.eye(4).to(light.photo_view), avatar.mesh(pose).vertices.mean(0)
+    axes[:3, 3] = light.photo_view - middle  # a camera behind the hand, from where only its place matters
+    near, far = avatar.pose(pose).colors, avatar.pose(pose, camera=avatar.source_camera._replace(viewmat=axes)).colors
+    if torch.equal(near, far):
+        return None
+    y_down_axes = torch.diag(axes.new_tensor(HALF_TURN)) @ photo_axes(avatar.source_camera).to(axes)
+    toward = -(y_down_axes @ light.photo_view)  # harmonics are of the direction from the camera
+    count = (DEGREE + 1) ** 2
+    basis = spherical_harmonics(DEGREE, toward.expand(count, 3), torch.eye(count).to(axes)[..., None].expand(-1, -1, 3))
+    degrees = torch.arange(count).float().sqrt().floor().long()
+    zonal = axes.new_tensor(narrow_lobe() * 4 * np.pi / (2 * np.arange(DEGREE + 1) + 1))
+    share = zonal[degrees.to(zonal.device)] * basis[:, 0]
+    harmonics = (near - far)[:, None] * share[:, None]
+    harmonics[:, 0] += (far - 0.5) / SH_C0
+    return harmonics.cpu()
+
+
+def narrow_lobe() -> np.ndarray:
+    """Legendre coefficients of the polynomial of the cosine that is 1 at 1 and then stays within `SIDE_LOBES`."""
+    wide = np.cosh(np.arccosh(1 / SIDE_LOBES) / DEGREE)  # where Chebyshev's polynomial is 1 / SIDE_LOBES
+    stretched = Polynomial([(wide - 1) / 2, (wide + 1) / 2])  # from -1 and 1 to -1 and there
+    return SIDE_LOBES * legendre.poly2leg(Chebyshev.basis(DEGREE).convert(kind=Polynomial)(stretched).coef)
 
 
 def photo_axes(camera: Camera) -> Float[Tensor, "3 3"]:
