@@ -14,25 +14,25 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
-from tests.export.splat_readers import READERS, play, read_gltf
+from tests.export.splat_readers import READERS, play, read_gltf, read_harmonics
 from torch import Tensor
 
 from oasis_warp.assets import asset
-from oasis_warp.core.camera import orbit_camera
+from oasis_warp.core.camera import camera_center, orbit_camera
 from oasis_warp.core.config import BLACK
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import Camera, Gaussians, HandPose
 from oasis_warp.data.photo import read_photo
 from oasis_warp.export import export_avatar, texture
 from oasis_warp.export.request import ExportRequest
-from oasis_warp.export.splats import posed_splats
+from oasis_warp.export.splats import photo_axes, posed_splats
 from oasis_warp.export.surface_mesh import mesh_points, topology
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
 from oasis_warp.hand.skinning import skin_surface
 from oasis_warp.hand.webxr_rig import TO_WEBXR
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses import masked_psnr
-from oasis_warp.ops import depth_map
+from oasis_warp.ops import depth_map, spherical_harmonics
 from oasis_warp.reconstruction import reconstruct
 from oasis_warp.render import render
 from studies.harness import Row, StudyOptions, measured
@@ -95,20 +95,41 @@ def write(avatar: Avatar, ending: str, options: Options, folder: Path) -> Row:
 
 @torch.no_grad()
 def measure_splats(ending: str, options: Options) -> Row:
-    """A file of Gaussians: what its means and pictures differ by from those that were written."""
+    """A file of Gaussians: what its means and pictures differ by from those that were written.
+
+    Colours are those seen from the photo's side, but in a .ply, which has them from all sides.
+    """
     avatar = the_avatar(options)
     with TemporaryDirectory() as name:
+        path = Path(name) / f"hand{ending}"
         row = write(avatar, ending, options, Path(name))
-        read = Gaussians(
-            *(torch.from_numpy(np.array(p, np.float32)) for p in READERS[ending](Path(name) / f"hand{ending}"))
-        )
+        read = Gaussians(*(torch.from_numpy(np.array(p, np.float32)) for p in READERS[ending](path)))
+        harmonics = read_harmonics(path) if ending == ".ply" else None
     true = posed_splats(ExportRequest(avatar))
     off = cKDTree(true.means.numpy()).query(read.means.numpy())[0].max()
     worst = math.inf
     for camera in views(true.means, options.size):
+        if harmonics is not None:
+            read = read._replace(colors=seen_colors(harmonics, read.means, camera))
+            true = true._replace(colors=avatar.pose(avatar.source_pose, camera=in_world(camera, avatar)).colors)
         drawn, expected = (render(gaussians, camera, background=BLACK) for gaussians in (read, true))
         worst = min(worst, masked_psnr(drawn.image, expected.image, ((drawn.alpha + expected.alpha) > 0).float()))
     return {**row, "gaussians": len(read.means), "off_um": 1e6 * float(off), "psnr": worst}
+
+
+def seen_colors(harmonics: Tensor, means: Tensor, camera: Camera) -> Tensor:
+    """Colours of Gaussians from `camera`, as 3DGS draws them; y of the means is up, that of the harmonics down."""
+    y_down = means.new_tensor([1.0, -1.0, -1.0])
+    directions = (means - camera_center(camera.viewmat)) * y_down
+    return (0.5 + spherical_harmonics(3, directions, harmonics)).clamp_min(0)
+
+
+def in_world(camera: Camera, avatar: Avatar) -> Camera:
+    """A camera among exported Gaussians in the world of the avatar."""
+    axes, wrist = photo_axes(avatar.source_camera), avatar.mesh(avatar.source_pose).joints[0]
+    moved = torch.eye(4)
+    moved[:3, :3], moved[:3, 3] = axes, -axes @ wrist
+    return camera._replace(viewmat=camera.viewmat @ moved)
 
 
 @torch.no_grad()

@@ -202,7 +202,9 @@ def test_detail_that_coarse_gaussians_cannot_show_is_shown(hand, case):
 
 def test_half_as_large_the_hand_is_as_like_the_photo_as_before(hand, case):
     crop, coarse, made = case
-    half = Camera(crop.camera.viewmat, crop.camera.K * torch.tensor([[0.5], [0.5], [1.0]]), FINE // 2, FINE // 2)
+    half = Camera(
+        crop.camera.viewmat, crop.camera.K * torch.tensor([[0.5], [0.5], [1.0]]), FINE // 2, FINE // 2
+    )
     image = avg_pool2d(crop.image.permute(2, 0, 1), 2).permute(1, 2, 0)
     inside = (avg_pool2d(judged(hand, crop)[None], 2)[0] == 1).float()
     before, after = (

@@ -399,7 +399,7 @@ def test_ink_on_single_gaussians_is_no_mark(hand, albedo_scene):
     parted = split_albedo_shading(hand, guess.colors, learned)
     clear = (learned.colors > 0.031).all(1)
     clear[:n_vertices] = False
-    ratio = (parted.colors / guess.colors).log().norm(dim=1) / (learned.colors / guess.colors).log().norm(dim=1)
+    ratio = ((parted.colors / guess.colors).log().norm(dim=1) / (learned.colors / guess.colors).log().norm(dim=1))
     there = clear & (torch.arange(len(clear)) % 2 == n_vertices % 2)
     assert int(there.sum()) > 100
     fine = (1 - ALBEDO_SHARE) * MAX_FINE * math.sqrt(3) / torch.tensor(INK).log().norm()

@@ -181,7 +181,9 @@ def test_nobody_looks_into_a_hand(hand, hands):
     middle = rest[hand.rim].mean(0)
     points = (middle + 0.6 * (rest[hand.rim] - middle)) @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     x, y, _ = (points @ camera.K.T / points[:, 2:]).long().unbind(1)
-    opened, closed = (render(pose_gaussians(g, hand.faces, rest, rest), camera).image[y, x] for g in (before, after))
+    opened, closed = (
+        render(pose_gaussians(g, hand.faces, rest, rest), camera).image[y, x] for g in (before, after)
+    )
     assert (closed - SKIN).abs().max() < 0.06
     assert (opened - SKIN).abs().max() > 0.3
 

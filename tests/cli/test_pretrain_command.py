@@ -130,10 +130,7 @@ def test_a_checkpoint_of_unknown_origin_is_refused(unbroken, tiny, tmp_path, cap
         (["--workers", "-1"], "--workers: expected 0 or more, got -1"),
         (["--profile", "paper"], "--profile paper: reads photos with dinov2-large; give its model.safetensors"),
         (["--profile", "paper", "--backbone-weights", "none"], "none: expected DINOv2 ViT-L/14, found no such file"),
-        (
-            ["--lpips", "a.pth", "b.pth"],
-            "a.pth: expected AlexNet, found no such file; download https://download.pytorch",
-        ),
+        (["--lpips", "a.pth", "b.pth"], "a.pth: expected AlexNet, found no such file; download https://download.pytorch"),
         (["--backbone-weights", "none"], "the compact profile trains its own encoder"),
     ],
 )

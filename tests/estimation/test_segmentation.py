@@ -247,7 +247,8 @@ def test_an_outline_stays_within_its_photo(entry):
 def test_holes_lie_inside_the_outline_and_are_uncovered(name, masks):
     (entry,) = (e for e in ENTRIES if mask_name(e["file"]) == name)
     (outer,), (hole,) = (
-        [_filled(points, masks[name].shape) for points in polygons_of(entry, kind)] for kind in ("outer", "hole")
+        [_filled(points, masks[name].shape) for points in polygons_of(entry, kind)]
+        for kind in ("outer", "hole")
     )
     assert hole.sum() > 100 and outer[hole].all()
     assert masks[name][hole].mean() < 0.1  # only the pixels its edge runs through are covered in part

@@ -12,8 +12,9 @@ from importlib.util import find_spec
 
 import cv2
 import numpy as np
+import torch
 
-from oasis_warp.data.splat_files import read_splats
+from oasis_warp.data.splat_files import _ply_elements, read_splats
 
 C0 = 0.28209479177387814
 UP = np.array([1, -1, -1])
@@ -35,6 +36,13 @@ def fill_in(largest, others):
 def read_as_view_does(path):
     means, quats, *others = (part.double().numpy() for part in read_splats(path))
     return *turned_up(means, quats), *others
+
+
+def read_harmonics(path):
+    """Spherical harmonics of degree 3 in a .ply, [N, 16, 3]; those of red come first in a row."""
+    rows = _ply_elements(path.read_bytes())["vertex"]
+    first, rest = (np.stack([rows[f"f_{kind}_{k}"] for k in range(n)], 1) for kind, n in (("dc", 3), ("rest", 45)))
+    return torch.from_numpy(np.concatenate([first[:, None], rest.reshape(-1, 3, 15).transpose(0, 2, 1)], 1)).float()
 
 
 def read_sog(path):

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
-from tests.export.splat_readers import READERS
+from tests.export.splat_readers import READERS, read_harmonics
 
 from oasis_warp.core import rotation
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Camera, Gaussians
-from oasis_warp.data.splat_files import _ply_elements, read_splats
+from oasis_warp.data.splat_files import read_splats
 from oasis_warp.export import export_avatar
 from oasis_warp.ops import rasterization
 from oasis_warp.render import render
@@ -115,15 +115,13 @@ def test_a_stream_of_zstd_gives_no_more_than_its_due(right_hand, tmp_path):
 def test_a_ply_shows_the_photos_shade_from_the_photos_side_alone(shaded, tmp_path):
     pose = shaded.source_pose
     export_avatar(shaded, tmp_path / "hand.ply")
-    rows = _ply_elements((tmp_path / "hand.ply").read_bytes())["vertex"]
-    first, rest = (np.stack([rows[f"f_{kind}_{k}"] for k in range(n)], 1) for kind, n in (("dc", 3), ("rest", 45)))
-    coefficients = torch.from_numpy(np.concatenate([first[:, None], rest.reshape(-1, 3, 15).transpose(0, 2, 1)], 1))
+    coefficients = read_harmonics(tmp_path / "hand.ply")
     splats, vertices = shaded.pose(pose), shaded.mesh(pose).vertices
     shown, source = {}, shaded.source_camera
     for degrees in (0, 60, 180):
         camera = orbit_camera(vertices, math.radians(degrees), size=96)
         drawn, _, _ = rasterization(
-            *splats[:4], coefficients.float(), camera.viewmat[None], camera.K[None], 96, 96, sh_degree=3
+            *splats[:4], coefficients, camera.viewmat[None], camera.K[None], 96, 96, sh_degree=3
         )
         shown[degrees] = psnr(drawn[0], shaded.render(camera, pose, (0.0, 0.0, 0.0)).image)
     assert source.viewmat[:3, :3].equal(torch.eye(3)), "the file's axes are those of the world"

@@ -120,10 +120,9 @@ def test_triangles_are_neither_slivers_nor_coincident(hand):
 def test_skinning_weights_are_shares(hand):
     assert hand.weights.min() >= 0
     torch.testing.assert_close(hand.weights.sum(1), torch.ones(N_VERTICES), rtol=0, atol=1e-6)
-    assert (
-        torch.equal(hand.segment, hand.weights.argmax(1))
-        or (hand.weights.gather(1, hand.segment[:, None])[:, 0] > hand.weights.amax(1) - 1e-6).all()
-    )
+    assert torch.equal(hand.segment, hand.weights.argmax(1)) or (
+        hand.weights.gather(1, hand.segment[:, None])[:, 0] > hand.weights.amax(1) - 1e-6
+    ).all()
     assert hand.segment.unique().tolist() == list(range(16))
 
 

@@ -67,6 +67,7 @@ def test_the_kernels_of_the_mean_difference_do_what_torch_does(size, covered):
     assert loss.isnan() and gradient[-1, -1, -1].isnan() and gradient.isnan().sum() == 1
 
 
+
 def test_losses_of_equal_images_are_zero(pair):
     image, _ = pair
     mask = torch.ones(image.shape[:2], dtype=image.dtype)

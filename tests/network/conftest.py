@@ -13,7 +13,9 @@ from oasis_warp.network.hand_network import HandNetwork
 @pytest.fixture(scope="session")
 def tiny():
     """The compact profile with few channels: every part is there, a pass takes a fifth of a second."""
-    return replace(COMPACT, image_size=64, width=32, heads=2, n_tokens=16, n_coarse=64, refine_layers=1, head_width=16)
+    return replace(
+        COMPACT, image_size=64, width=32, heads=2, n_tokens=16, n_coarse=64, refine_layers=1, head_width=16
+    )
 
 
 @pytest.fixture(scope="session")
@@ -21,7 +23,9 @@ def crops(hand):
     """A light palm and a dark back."""
     prior = MeanPrior(hand)
     light, _, _ = crop_of(hand, prior.vertex_colors(0.02), size=64, orientation=PALM_TO_CAMERA)
-    dark, _, _ = crop_of(hand, prior.vertex_colors(0.2), size=64, orientation=BACK_TO_CAMERA, pose_name="fist")
+    dark, _, _ = crop_of(
+        hand, prior.vertex_colors(0.2), size=64, orientation=BACK_TO_CAMERA, pose_name="fist"
+    )
     return light, dark
 
 

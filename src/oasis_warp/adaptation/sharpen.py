@@ -162,7 +162,9 @@ def _lit(
     return gaussians._replace(colors=lit, shade=None)
 
 
-def _source(crop: HandCrop, faces: Tensor, fading: Bool[Tensor, "F"], share: Float[Tensor, "V"]) -> Source:
+def _source(
+    crop: HandCrop, faces: Tensor, fading: Bool[Tensor, "F"], share: Float[Tensor, "V"]
+) -> Source:
     """The photo on its surface, weighted by `share`, and by 0 on `fading` faces."""
     posed, canvas = crop.posed.vertices, Canvas(crop.image, _faded_in(crop.mask), crop.camera)
     seen = map_surface(posed, faces, canvas, FACING)

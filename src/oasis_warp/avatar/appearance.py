@@ -114,7 +114,9 @@ def label_regions(hand: HandModel) -> Regions:
     )
     crease = (crease + torch.where(level == 1, _bump(hand.bone_t, 0.52, 0.05), 0)).clamp(max=1) * palm
     soften = surface.smooth_over_mesh(torch.stack([tip, knuckle, crease], -1), edges, 1)
-    return Regions(palm, *soften.unbind(-1), _smoothstep(hand.nail, 0.3, 0.7), _mottle(len(hand.template), edges))
+    return Regions(
+        palm, *soften.unbind(-1), _smoothstep(hand.nail, 0.3, 0.7), _mottle(len(hand.template), edges)
+    )
 
 
 def region_colors(regions: Regions, melanin: float) -> Float[Tensor, "V 3"]:

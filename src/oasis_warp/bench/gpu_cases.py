@@ -101,11 +101,7 @@ class Learning:
     def __init__(self, scene: AvatarScene):
         canonical, self.scene, self.surface = scene.canonical, scene, scene.surface()
         stored = (
-            canonical.offsets,
-            canonical.quats,
-            canonical.scales.log(),
-            canonical.opacities.logit(),
-            canonical.colors,
+            canonical.offsets, canonical.quats, canonical.scales.log(), canonical.opacities.logit(), canonical.colors
         )
         self.leaves = [part.detach().clone().requires_grad_(True) for part in stored]
         self.optimizer = torch.optim.Adam(self.leaves, lr=0.0, fused=True, capturable=scene.target.is_cuda)

@@ -24,7 +24,9 @@ def number(value: float | None, digits: int = 1) -> str:
     return "" if value is None or not math.isfinite(value) else f"{value:.{digits}e}" if value else "0"
 
 
-def new_table(left: Sequence[str], right: Sequence[str] = (), title: str | None = None, wrap: bool = False) -> Table:
+def new_table(
+    left: Sequence[str], right: Sequence[str] = (), title: str | None = None, wrap: bool = False
+) -> Table:
     """An empty table with columns of words, aligned left, which may `wrap`, and of numbers, aligned right."""
     table = Table(title=title, title_justify="left")
     for heading in left:

@@ -80,7 +80,9 @@ EDIT_PLAN = (
 class Run:
     """A `Progress` that knows the plan of its run, which may consist of several equal parts, such as photos."""
 
-    def __init__(self, plan: Sequence[Step], n_parts: int = 1, *, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, plan: Sequence[Step], n_parts: int = 1, *, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self._length = len(plan)
         self._plan = [*plan] * n_parts
         self._total = sum(step.seconds for step in self._plan)

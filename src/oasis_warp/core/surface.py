@@ -52,7 +52,9 @@ def mesh_edges(faces: Int[Tensor, "F 3"]) -> Int[Tensor, "E 2"]:
     return torch.stack([keys // n, keys % n], 1).to(faces.dtype)
 
 
-def smooth_over_mesh(values: Float[Tensor, "V D"], edges: Int[Tensor, "E 2"], passes: int) -> Float[Tensor, "V D"]:
+def smooth_over_mesh(
+    values: Float[Tensor, "V D"], edges: Int[Tensor, "E 2"], passes: int
+) -> Float[Tensor, "V D"]:
     """Mean of each vertex and its neighbours, `passes` times."""
     ones = torch.ones(len(edges), 1, dtype=values.dtype, device=values.device)
     both = torch.cat([edges, edges.flip(1)])

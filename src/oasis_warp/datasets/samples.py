@@ -244,7 +244,9 @@ def numbers(value: Any, *shape: int, what: str) -> np.ndarray:
     return array
 
 
-def pose_of_48(model: ManoModel, pose: Any, betas: Any, transl: Any, *, with_mean: bool) -> ManoPose:
+def pose_of_48(
+    model: ManoModel, pose: Any, betas: Any, transl: Any, *, with_mean: bool
+) -> ManoPose:
     """MANO's parameters from 48 angles, 10 shapes and a translation [m].
 
     Args:

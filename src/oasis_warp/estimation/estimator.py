@@ -202,7 +202,9 @@ def choose_hand(
         if of_side:
             return of_side[0]
         wanted = f"a {which} hand"
-    listed = ", ".join(f"hand {i} ({hand.side}, {box_size(array(hand.xy)):.0f} px)" for i, hand in enumerate(found))
+    listed = ", ".join(
+        f"hand {i} ({hand.side}, {box_size(array(hand.xy)):.0f} px)" for i, hand in enumerate(found)
+    )
     raise InputError(f"{photo_name}: expected {wanted}, found {listed}; choose another --hand, or mirror the photo.")
 
 

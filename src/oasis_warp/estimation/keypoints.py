@@ -153,7 +153,9 @@ def _check_points(name: str, xy: np.ndarray, photo: Photo) -> None:
         raise InputError(f"{name}: all points lie within {MIN_PIXELS} pixels; give 21 different ones of a hand.")
 
 
-def _state(kinematics: HandKinematics, side: Side, shape: np.ndarray, pose: HandPose, camera: Camera) -> FitState:
+def _state(
+    kinematics: HandKinematics, side: Side, shape: np.ndarray, pose: HandPose, camera: Camera
+) -> FitState:
     """`mirrored_state` with all 45 angles of the pose."""
     table = np.concatenate([np.zeros((1, 3)), pose.angles.double().numpy()])
     return replace(mirrored_state(kinematics, side, shape, pose, camera), angles=table)

@@ -78,7 +78,9 @@ def full_camera(
     return np.array([shift[0] + weak[1], shift[1] + weak[2], 2 * focal / scale])
 
 
-def read_estimate(path: Path, photo: Photo, which: Which = "largest", content: bytes | None = None) -> Estimate:
+def read_estimate(
+    path: Path, photo: Photo, which: Which = "largest", content: bytes | None = None
+) -> Estimate:
     """One hand of an .npz or pickle file of an estimator.
 
     Args:

@@ -162,7 +162,9 @@ def refine(
 class _Problem:
     """The cost of explaining one photo by a state of the fit."""
 
-    def __init__(self, hand: HandModel, guess: CanonicalGaussians, crop: HandCrop, landmarks: Tensor | None, size: int):
+    def __init__(
+        self, hand: HandModel, guess: CanonicalGaussians, crop: HandCrop, landmarks: Tensor | None, size: int
+    ):
         self.kinematics, camera = HandKinematics(hand), crop.camera
         device = crop.image.device
         self.hand = hand.to(device)
@@ -307,10 +309,14 @@ class _Problem:
         return PhotoError(float(loss.sum()) / PHOTO_WEIGHT, overlap, int((share > 0).sum()))
 
 
-def _anchor(kinematics: HandKinematics, start: FitState, size: tuple[int, int], landmarks: Tensor | None) -> Fitter:
+def _anchor(
+    kinematics: HandKinematics, start: FitState, size: tuple[int, int], landmarks: Tensor | None
+) -> Fitter:
     """The fit's terms, with bones at the start and, where none were detected, the landmarks at the start."""
     points = kinematics.landmarks(kinematics.pose_joints(start.angles, start.shape))[0]
     xy, seen = start.project(points) if landmarks is None else array(landmarks), start.in_camera(points)
     bones = unit(seen[BONES[:, 1]] - seen[BONES[:, 0]])
     settings = UNDETECTED if landmarks is None else DETECTED
-    return Fitter(kinematics, FitTarget(xy, bones, None, None, size, start.focal), settings=settings, shape=start.shape)
+    return Fitter(
+        kinematics, FitTarget(xy, bones, None, None, size, start.focal), settings=settings, shape=start.shape
+    )

@@ -94,7 +94,8 @@ def _along_edges(
 ) -> np.ndarray:
     """The soft mask of probabilities `hand`, drawn along the edges of the image; `band` in its pixels."""
     inside, outside = (
-        cv2.distanceTransform((side > 0.5).astype(np.uint8), cv2.DIST_L2, 3) for side in (hand, 1 - hand)
+        cv2.distanceTransform((side > 0.5).astype(np.uint8), cv2.DIST_L2, 3)
+        for side in (hand, 1 - hand)
     )
     labels = np.where(hand > 0.5, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     labels[(inside > band) & (hand > _SURE_HAND)] = cv2.GC_FGD

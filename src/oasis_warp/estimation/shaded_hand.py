@@ -104,7 +104,9 @@ def solve_light(scene: ShadingScene, rendered: RenderedSurface, pose: int) -> Fl
 def harmonics(normal: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 9"]:
     """Real spherical harmonics up to degree 2, not normalised."""
     x, y, z = normal.unbind(-1)
-    return torch.stack([torch.ones_like(x), x, y, z, x * y, y * z, 3 * z * z - 1, x * z, x * x - y * y], -1)
+    return torch.stack(
+        [torch.ones_like(x), x, y, z, x * y, y * z, 3 * z * z - 1, x * z, x * x - y * y], -1
+    )
 
 
 def detail_gap(

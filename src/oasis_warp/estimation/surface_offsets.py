@@ -98,7 +98,9 @@ def rendered_outline_offsets(
         crops: Photos of one hand with one surface at rest, at the size of the images that will be rendered.
     """
     faces, like = hand.faces.to(crops[0].mask.device), crops[0].rest.vertices
-    normals = [[surface.vertex_normals(part.vertices, faces) for part in (crop.rest, crop.posed)] for crop in crops]
+    normals = [
+        [surface.vertex_normals(part.vertices, faces) for part in (crop.rest, crop.posed)] for crop in crops
+    ]
     sheet = ThinSheet(hand.faces.cpu().numpy(), len(hand.template))
     outward = np.zeros(len(hand.template))
     for _ in range(_RENDERED_ROUNDS):

@@ -69,7 +69,9 @@ class Looks(NamedTuple):
 
 
 @torch.no_grad()
-def measure_looks(photo: Photo, made: Reconstruction, group: str, perceptual: Perceptual | None = None) -> Looks:
+def measure_looks(
+    photo: Photo, made: Reconstruction, group: str, perceptual: Perceptual | None = None
+) -> Looks:
     """Draw the views of the avatar of `photo` and measure them.
 
     The record holds `contrast` (of `contrast_measures`), blemishes (of `blemish_measures`) and, where there is

@@ -99,7 +99,7 @@ def step_to_points(
     residual = turned + hand.translation - points
     if normals is not None:
         residual = (residual * normals).sum(1, keepdims=True)
-        jacobian = normals[:, None] @ jacobian
+        jacobian = (normals[:, None] @ jacobian)
     squared = (residual**2).sum(1) / sigma**2
     weight = (1 + squared / _FAR**2) ** -1 / sigma
     residual, jacobian = (residual * weight[:, None]).ravel(), (jacobian * weight[:, None, None]).reshape(-1, n)

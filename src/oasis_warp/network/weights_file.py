@@ -138,7 +138,9 @@ def _checked_header(path: Path, file: Any) -> dict[str, Any]:
         raise InputError(f"{path}: a safetensors file, but not a network; give one that `oasis pretrain` wrote.")
     version = header.get("version")
     if type(version) is int and version > VERSION:
-        raise InputError(f"{path}: a network of version {version}, newer than the known {VERSION}; update oasis-warp.")
+        raise InputError(
+            f"{path}: a network of version {version}, newer than the known {VERSION}; update oasis-warp."
+        )
     wrong = [key for key, kind in HEADER.items() if type(header.get(key)) is not kind]
     if wrong or version != VERSION:
         raise InputError(f"{path}: damaged, its header has no valid {(wrong or ['version'])[0]}; copy it again.")

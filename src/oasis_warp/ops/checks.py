@@ -71,12 +71,8 @@ def check_float(name: str, tensor: Tensor, like: Tensor | None = None) -> None:
         raise ValueError(_sentence(name, "a tensor on cpu or cuda", f"one on {tensor.device}", ""))
     if like is not None and (tensor.dtype != like.dtype or tensor.device != like.device):
         raise ValueError(
-            _sentence(
-                name,
-                f"{like.dtype} on {like.device}",
-                f"{tensor.dtype} on {tensor.device}",
-                "All arguments of one call share them.",
-            )
+            _sentence(name, f"{like.dtype} on {like.device}", f"{tensor.dtype} on {tensor.device}",
+                      "All arguments of one call share them.")
         )
 
 

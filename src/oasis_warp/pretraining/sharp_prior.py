@@ -163,7 +163,9 @@ class SharpPriorTrainer(PriorTrainer):
         with torch.no_grad():
             _, wanted = self.discriminator(real)
             contrast = (fake[:, :3].square().sum() / real[:, :3].square().sum().clamp_min(1e-6)).sqrt()
-        apart = [weighted_mean((own - other).abs(), hidden.judged) for own, other in zip(found, wanted, strict=True)]
+        apart = [
+            weighted_mean((own - other).abs(), hidden.judged) for own, other in zip(found, wanted, strict=True)
+        ]
         return {
             "wide": wide_difference(drawn.images, true.images, true.alphas * hidden.share),
             "adversarial": weighted_mean(softplus(-logits), hidden.judged),

@@ -121,19 +121,15 @@ def _shining(batch: DenseBatch, random: torch.Generator) -> Float[Tensor, "B 3 H
 
     toward = torch.randn(count, 3, 1, 1, generator=random, device=device)
     toward = torch.nn.functional.normalize(torch.cat([toward[:, :2], -toward[:, 2:].abs()], 1), dim=1)
-    # to the edge of the skin, whose outermost pixels have no normals
-    skin = batch.skin[:, None].float()
+    skin = batch.skin[:, None].float()  # its outermost pixels have no normals
     near = avg_pool2d(torch.cat([batch.normal * skin, skin], 1), 5, 1, 2)
     normal = torch.nn.functional.normalize(near[:, :3], dim=1)
     lobe = (normal * toward).sum(1, keepdim=True).clamp_min(0) ** between(*map(math.log, GLOSS_POWERS)).exp()
     strength = between(*map(math.log, GLOSS)).exp() * (between(0.0, 1.0) < GLOSSY)
     tint = 1 + 0.1 * torch.randn(count, 3, 1, 1, generator=random, device=device)
     share = batch.classes[:, 1:2] * (near[:, 3:] > 0)
-    return srgb(
-        (linear_light(batch.image.movedim(1, -1)).movedim(-1, 1) + share * strength * tint.clamp_min(0) * lobe).clamp(
-            0, 1
-        )
-    )
+    gloss = share * strength * tint.clamp_min(0) * lobe
+    return srgb((linear_light(batch.image.movedim(1, -1)).movedim(-1, 1) + gloss).clamp(0, 1))
 
 
 def moved(batch: DenseBatch, random: torch.Generator) -> DenseBatch:
