@@ -18,9 +18,9 @@ from oasis_warp.avatar.appearance import (
 )
 from oasis_warp.avatar.densify import densify
 from oasis_warp.avatar.pose import pose_gaussians, with_photo
-from oasis_warp.avatar.wrist import close_wrist, end_shade
+from oasis_warp.avatar.wrist import ARM_LENGTH, close_wrist, end_shade, fading_arm, rim_axis
 from oasis_warp.core import rotation, surface
-from oasis_warp.core.camera import orbit_camera
+from oasis_warp.core.camera import orbit_camera, project
 from oasis_warp.core.mirror import mirror_canonical, mirror_points
 from oasis_warp.core.types import HandLight, HandPose
 from oasis_warp.hand.poses import named_pose
@@ -175,6 +175,12 @@ def centers(hand, rest, gaussians):
     return torch.cat([rest[gaussians.vertex_index] + gaussians.offsets, on_faces])
 
 
+def arm_of(hand, rest, gaussians):
+    """Indices of the arm's Gaussians, the last of those on vertices."""
+    end, count = len(gaussians.vertex_index), len(fading_arm(rest, hand.rim)[0])
+    return torch.arange(end - count, end)
+
+
 def test_nobody_looks_into_a_hand(hand, hands):
     rest, before, after = hands
     camera = orbit_camera(rest, -math.pi / 2, size=96)  # where the arm would be: the hand lies along -x
@@ -194,7 +200,9 @@ def test_the_end_is_opaque_and_has_the_colour_of_the_skin_before_it(hand, hands)
     def end(gaussians):
         return torch.cdist(centers(hand, rest, gaussians), rest[hand.rim]).amin(1) < 0.3 * RIM_FADE
 
-    assert after.opacities[end(after)].min() > 0.9 and before.opacities[end(before)].median() < 0.5
+    skin = end(after)
+    skin[arm_of(hand, rest, after)] = False
+    assert after.opacities[skin].min() > 0.9 and before.opacities[end(before)].median() < 0.5
     apart = (after.colors[end(after)] - SKIN).abs()
     assert apart.median() < 1e-3 and apart.max() < 0.06  # the detail of the edge to the palm comes along
 
@@ -218,8 +226,27 @@ def test_the_hand_beyond_the_fade_keeps_its_bits_and_the_cap_goes_with_the_wrist
         assert torch.equal(getattr(before, name)[beyond[0]], getattr(after, name)[beyond[1] & ~cap])
     fist = HandPose(named_pose(hand, "fist"), torch.eye(3), torch.zeros(3))
     posed = skin(hand, rest_hand(hand, torch.zeros(hand.shape_basis.shape[-1])), fist).vertices
-    still, moved = (pose_gaussians(after, hand.faces, rest, to).means[cap] for to in (rest, posed))
-    assert (moved - still).norm(dim=1).max() < 0.004  # the rim itself moves by less than that
+    still, moved = (pose_gaussians(after, hand.faces, rest, to).means for to in (rest, posed))
+    shift, arm = (moved - still).norm(dim=1), arm_of(hand, rest, after)
+    assert shift[arm].max() < 0.008
+    shift[arm] = 0
+    assert shift[cap].max() < 0.004  # the rim itself moves by less than that
+
+
+def test_the_arm_fades_from_the_rim_on_and_hides_the_cap_along_it(hand, hands):
+    """A hand that ended at once looked sawn off, in all of 52 sheets."""
+    rest, _, after = hands
+    axis, middle, arm = rim_axis(rest, hand.rim), rest[hand.rim].mean(0), arm_of(hand, rest, after)
+    height = (centers(hand, rest, after)[arm] - middle) @ axis
+    assert 0 < height.min() < 0.004 and 0.054 < height.max() < ARM_LENGTH
+    assert after.opacities[arm][height < 0.005].min() > 0.6 and after.opacities[arm][height > 0.054].max() < 0.03
+    camera = orbit_camera(torch.cat([rest, rest + ARM_LENGTH * axis]), 0.0, size=128)
+    alpha = render(pose_gaussians(after, hand.faces, rest, rest), camera).alpha
+    seen = []
+    for share in (0.1, 0.5, 0.9):
+        x, y = project(camera, (middle + share * ARM_LENGTH * axis)[None])[0][0].long()
+        seen.append(float(alpha[y, x]))
+    assert seen[0] > 0.95 and 0.3 < seen[1] < 0.9 and seen[2] < 0.2
 
 
 def test_light_falls_on_the_cap_as_on_a_rounded_end(hand, hands):

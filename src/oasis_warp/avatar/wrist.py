@@ -1,4 +1,4 @@
-"""The end of the hand at the wrist: opaque skin up to the rim, and a rounded cap over the opening."""
+"""The end of the hand at the wrist: opaque skin up to the rim, a rounded cap over the opening, an arm that fades."""
 
 import math
 
@@ -42,6 +42,16 @@ DARKEST = 0.02
 CONTRAST = 0.03
 """Largest standard deviation of that detail's logarithm, the finest contrast of real palms: more is the edge of a
 shadow or of a sleeve."""
+ARM_LENGTH = 0.06
+"""The stretch past the rim over which an arm fades out [m]: a hand that ends at once looks sawn off."""
+ARM_GROWTH = 0.1
+"""How much wider the arm is at its end than at the rim."""
+ARM_STEP = 0.002
+"""Distance of the arm's Gaussians [m], that of the skin's vertices."""
+FILL_STEP = 0.004
+"""Distance of the balls that fill the arm [m]."""
+ARM_LAYERS, FILL_LAYERS = 2.5, 12.0
+"""Numbers of the arm's Gaussians and of balls one behind the other, each of them so much fainter."""
 RIM_PARTS = -1 / 3, 0.0, 1 / 3
 """Places of Gaussians along the edges at a vertex of the rim, as shares of the edge: one on each vertex makes teeth."""
 RIM_SPREAD = 0.8
@@ -54,8 +64,8 @@ def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tens
     """Close the hand at the wrist, where a prior's opacity fades out because photos show an arm there.
 
     Gaussians in the second half of the fade are replaced by opaque ones on every vertex and face; the others become as
-    opaque as they were before the fade. The cap's Gaussians are bound to rim vertices. New Gaussians continue the
-    colours of those before the fade, without shade; the shade of the others ends before.
+    opaque as they were before the fade. The Gaussians of cap and arm are bound to rim vertices. New Gaussians continue
+    the colours of those before the fade, without shade; the shade of the others ends before.
 
     Args:
         hand: Model of the surface.
@@ -71,12 +81,16 @@ def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tens
     inside = torch.ones_like(at_vertices).index_fill(0, rim, 0) > 0
     vertices, on_faces = (torch.nonzero(part)[:, 0] for part in ((at_vertices < OVERLAP) & inside, at_faces < OVERLAP))
     rows = vertices, len(rest) + on_faces
-    end = rim_line(rest, rim, full.quats[0, rim]), rim_cap(rest, rim)
+    *arm, arm_opacities = fading_arm(rest, rim)
+    end = rim_line(rest, rim, full.quats[0, rim]), rim_cap(rest, rim), arm
     index, offsets, end_quats, end_scales = (torch.cat(parts) for parts in zip(*end, strict=True))
     scales = full.scales[0]
     points = torch.cat([rest[vertices], rest[index] + offsets])
     read = _continued(gaussians, own, rest, faces, rim, torch.cat([points, rest[faces[on_faces]].mean(1)]))
     read = read.split([len(points), len(on_faces)])
+
+    opaque = rest.new_full((len(points) + len(on_faces) - len(arm_opacities),), OPACITY)
+    on_points, of_faces = opaque.split([len(points) - len(arm_opacities), len(on_faces)])
 
     def joined(old: Tensor, of_points: Tensor, of_faces: Tensor) -> Tensor:
         return torch.cat([old[:n_kept], of_points, old[n_kept:], of_faces])
@@ -91,7 +105,7 @@ def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tens
         torch.cat([kept.barycentrics, rest.new_full((len(on_faces), 3), 1 / 3)]),
         joined(kept.quats, torch.cat([full.quats[0, rows[0]], end_quats]), full.quats[0, rows[1]]),
         joined(kept.scales, torch.cat([scales[rows[0]], end_scales]), scales[rows[1]]),
-        joined(kept.opacities, *(rest.new_full((len(part),), OPACITY) for part in (points, on_faces))),
+        joined(kept.opacities, torch.cat([on_points, arm_opacities]), of_faces),
         joined(kept.colors, *read),
         None if shade is None else joined(shade, *(torch.ones_like(part) for part in read)),
     )
@@ -182,32 +196,75 @@ def rim_cap(
     With arms a from the middle of the rim to its points, p = cos(f) a + sin(f) h: half an ellipsoid, which continues
     the skin without an edge. Points of a ring are as far apart as the rings.
     """
-    edge, center, n = rest[rim], rest[rim].mean(0), len(rim)
-    arms, axis = edge - center, rim_axis(rest, rim)
-    along = arms.roll(-1, 0) - arms.roll(1, 0)
-    outward = torch.linalg.cross(along, axis.expand_as(along))
-    outward = outward * torch.sign((outward * arms).sum())
+    edge, axis = rest[rim], rim_axis(rest, rim)
+    arms = edge - edge.mean(0)
     step = float(math.pi / 2 / CAP_RINGS)
     length = step * math.hypot(float(arms.norm(dim=1).mean()), CAP_HEIGHT) / math.sqrt(2)  # of a step, in the mean
-    around = float((edge - edge.roll(1, 0)).norm(dim=1).sum())
-    fields = torch.cat([arms, outward, along], 1)
     index, offsets, normals, tangents = [], [], [], []
     for k in range(1, CAP_RINGS + 1):
         share, height = math.cos(step * k), math.sin(step * k)
-        count = max(1, round(around * share / length))
-        place = (torch.arange(count, device=rim.device) + 0.5 * (k % 2)) * (n / count)
-        first, second = place.long() % n, (place.long() + 1) % n
-        between = (place - place.floor()).to(arms)[:, None]
-        arm, out, tangent = torch.lerp(fields[first], fields[second], between).split(3, 1)
-        rows = torch.where(between[:, 0] < 0.5, first, second)
+        rows, arm, out, tangent = _ring(edge, axis, length / share, 0.5 * (k % 2))
         index.append(rows)
-        offsets.append(center + share * arm + height * CAP_HEIGHT * axis - edge[rows])
+        offsets.append(edge.mean(0) + share * arm + height * CAP_HEIGHT * axis - edge[rows])
         flat = out.norm(dim=1, keepdim=True) * arm.norm(dim=1, keepdim=True) * axis
         normals.append(normalize(share * CAP_HEIGHT * out + height * flat, dim=-1))
         tangents.append(tangent)
-    spread = torch.full_like(rest[:1, 0], CAP_SPREAD * VERTEX_SPREAD * length / math.sqrt(math.pi))
-    scales = torch.stack([spread, spread, THICKNESS * spread], 1).expand(len(torch.cat(index)), 3)
-    return rim[torch.cat(index)], torch.cat(offsets), surface_frames(torch.cat(normals), torch.cat(tangents)), scales
+    quats = surface_frames(torch.cat(normals), torch.cat(tangents))
+    return rim[torch.cat(index)], torch.cat(offsets), quats, _discs(length, quats)
+
+
+def fading_arm(
+    rest: Float[Tensor, "V 3"], rim: Int[Tensor, "R"]
+) -> tuple[Int[Tensor, "M"], Float[Tensor, "M 3"], Float[Tensor, "M 4"], Float[Tensor, "M 3"], Float[Tensor, "M"]]:
+    """Vertex Gaussians of an arm that continues the rim and fades out, as `rim_cap` gives them, and their opacities.
+
+    It is filled past the cap: seen along the arm, the cap would be a disc in a hollow.
+    """
+    edge, axis = rest[rim], rim_axis(rest, rim)
+    radius = float((edge - edge.mean(0)).norm(dim=1).mean())
+    walls = [(k * ARM_STEP / ARM_LENGTH, 1.0, ARM_STEP) for k in range(1, round(ARM_LENGTH / ARM_STEP))]
+    sections = [CAP_HEIGHT + k * FILL_STEP for k in range(1, round((ARM_LENGTH - CAP_HEIGHT) / FILL_STEP))]
+    n_rings = round(radius / FILL_STEP)
+    fill = [(height / ARM_LENGTH, (k + 0.5) / n_rings, FILL_STEP) for height in sections for k in range(n_rings)]
+    index, offsets, normals, tangents, scales, opacities = [], [], [], [], [], []
+    for k, (share, out, length) in enumerate(walls + fill):
+        rows, arm, outward, tangent = _ring(edge, axis, length / out, 0.5 * (k % 2))
+        index.append(rows)
+        wide = out * (1 + ARM_GROWTH * share**2)
+        offsets.append(edge.mean(0) + wide * arm + share * ARM_LENGTH * axis - edge[rows])
+        inside = out < 1
+        normals.append(axis.expand_as(arm) if inside else normalize(outward, dim=-1))
+        tangents.append(tangent)
+        flat = _discs(length, arm)
+        scales.append(flat[:, :1].expand(-1, 3) if inside else flat)
+        seen, layers = OPACITY * (1 - share) ** 2 * (1 + 2 * share), FILL_LAYERS if inside else ARM_LAYERS
+        opacities.append(torch.full_like(arm[:, 0], 1 - (1 - seen) ** (1 / layers)))
+    quats = surface_frames(torch.cat(normals), torch.cat(tangents))
+    return rim[torch.cat(index)], torch.cat(offsets), quats, torch.cat(scales), torch.cat(opacities)
+
+
+def _ring(
+    edge: Float[Tensor, "R 3"], axis: Float[Tensor, "3"], length: float, shift: float
+) -> tuple[Int[Tensor, "M"], Float[Tensor, "M 3"], Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
+    """Points about `length` apart on the rim: the nearest of its points, arms from its middle, outward, along it."""
+    arms, n = edge - edge.mean(0), len(edge)
+    along = arms.roll(-1, 0) - arms.roll(1, 0)
+    outward = torch.linalg.cross(along, axis.expand_as(along))
+    outward = outward * torch.sign((outward * arms).sum())
+    around = float((edge - edge.roll(1, 0)).norm(dim=1).sum())
+    count = max(1, round(around / length))
+    place = (torch.arange(count, device=edge.device) + shift) * (n / count)
+    first, second = place.long() % n, (place.long() + 1) % n
+    between = (place - place.floor()).to(arms)[:, None]
+    fields = torch.cat([arms, outward, along], 1)
+    arm, out, tangent = torch.lerp(fields[first], fields[second], between).split(3, 1)
+    return torch.where(between[:, 0] < 0.5, first, second), arm, out, tangent
+
+
+def _discs(length: float, rows: Float[Tensor, "M D"]) -> Float[Tensor, "M 3"]:
+    """Scales of flat Gaussians that lie `length` apart, one for each of the rows."""
+    spread = torch.full_like(rows[:1, 0], CAP_SPREAD * VERTEX_SPREAD * length / math.sqrt(math.pi))
+    return torch.stack([spread, spread, THICKNESS * spread], 1).expand(len(rows), 3)
 
 
 def select(gaussians: CanonicalGaussians, kept: Bool[Tensor, "N"]) -> CanonicalGaussians:

@@ -32,12 +32,14 @@ from oasis_warp.evaluation.views import (
     DRAWN_SIZE,
     Surface,
     View,
+    clear_of_arm,
     draw,
     read_crop,
     read_surface,
     shrink,
     silhouette,
     views_of,
+    without_arm,
     wrist_end,
 )
 from oasis_warp.hand.template import bundled_hand
@@ -51,6 +53,7 @@ class Picture(NamedTuple):
 
     view: View
     image: Float[Tensor, "S S 3"]
+    """Without the arm."""
     alpha: Float[Tensor, "S S"]
     surface: Surface
     large: Render
@@ -122,8 +125,10 @@ def draw_pictures(avatar: Avatar, visibility: Float[Tensor, "V"]) -> list[Pictur
         drawn = draw(avatar, view)
         vertices = avatar.mesh(view.pose).vertices.cpu()
         surface = read_surface(hand, vertices, view.camera, visibility, palm, left=left)
+        surface = clear_of_arm(hand, surface, vertices, view.camera)
         large = Render(drawn.image.cpu().clamp(0, 1), drawn.alpha.cpu())
-        pictures.append(Picture(view, shrink(large.image), shrink(large.alpha), surface, large))
+        bare = without_arm(hand, large, vertices, view.camera)
+        pictures.append(Picture(view, shrink(bare.image), shrink(bare.alpha), surface, large))
     return pictures
 
 

@@ -12,7 +12,8 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 
 from oasis_warp.avatar.appearance import label_regions
 from oasis_warp.avatar.observation import facing, inner_mask, observe
-from oasis_warp.core.camera import crop_camera, orbit_camera, project
+from oasis_warp.avatar.wrist import ARM_LENGTH, rim_axis
+from oasis_warp.core.camera import camera_center, crop_camera, orbit_camera, project
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.surface import face_normals
 from oasis_warp.core.types import Camera, HandCrop, HandPose, Render
@@ -38,6 +39,8 @@ RIM = 4
 JUMP = 0.005
 """Difference of the depth of neighbouring pixels that makes an outline inside the hand [m]: half a finger."""
 
+BESIDE = 2
+"""Pixels around the mesh that belong to the hand and not to its arm."""
 WRIST_REACH = 0.015
 """Distance from the wrist's opening within which a hand ends [m]: opacity fades over 8 mm before it, and the skin
 is rounded over 8 mm past it."""
@@ -139,8 +142,10 @@ def silhouette(faces: Int[Tensor, "F 3"], vertices: Float[Tensor, "V 3"], camera
 
 
 def wrist_end(hand: HandModel, vertices: Float[Tensor, "V 3"], camera: Camera) -> Bool[Tensor, "H W"]:
-    """Pixels within `WRIST_REACH` of the opening of the wrist."""
-    rim = vertices[hand.rim.to(vertices.device)]
+    """Pixels within `WRIST_REACH` of the opening of the wrist and of the arm that fades from there."""
+    index = hand.rim.to(vertices.device)
+    edge, arm = vertices[index], ARM_LENGTH * rim_axis(vertices, index)
+    rim = torch.cat([edge, edge + arm])
     viewed = Camera(camera.viewmat.to(rim), camera.K.to(rim), camera.width, camera.height)
     xy, depth = project(viewed, rim)
     plane = np.zeros((camera.height, camera.width), np.uint8)
@@ -149,6 +154,25 @@ def wrist_end(hand: HandModel, vertices: Float[Tensor, "V 3"], camera: Camera) -
     reach = math.ceil(WRIST_REACH * float(viewed.K[0, 0] / depth.mean()))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     return torch.from_numpy(cv2.dilate(plane, disc) > 0)
+
+
+def without_arm(hand: HandModel, drawn: Render, vertices: Float[Tensor, "V 3"], camera: Camera) -> Render:
+    """A picture over `GROUND` without the arm, which photos of hands are cut out without, too."""
+    on_hand = silhouette(hand.faces, vertices, camera).float()
+    kept = max_pool2d(on_hand[None], 2 * BESIDE + 1, 1, BESIDE)[0] > 0
+    arm = (wrist_end(hand, vertices, camera) & ~kept)[..., None]
+    ground = drawn.image.new_tensor(GROUND)
+    return Render(torch.where(arm, ground, drawn.image), drawn.alpha.masked_fill(arm[..., 0], 0))
+
+
+def clear_of_arm(hand: HandModel, surface: Surface, vertices: Float[Tensor, "V 3"], camera: Camera) -> Surface:
+    """`surface` without the interior that lies behind the arm, where that comes towards the camera."""
+    rim = hand.rim.to(vertices.device)
+    toward = camera_center(camera.viewmat.to(vertices)) - vertices[rim].mean(0)
+    if float(toward @ rim_axis(vertices, rim)) <= 0:
+        return surface
+    small = crop_camera(camera, 0.0, 0.0, float(camera.width), SIZE)
+    return surface._replace(interior=surface.interior & ~wrist_end(hand, vertices, small))
 
 
 def clear_of_outlines(depth: Float[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
