@@ -10,7 +10,7 @@ from torch import Tensor
 from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.adaptation.prior_guess import Calibration, calibrate, mix_guesses
 from oasis_warp.adaptation.reliability import VertexObservations, observe_photos, photo_gains
-from oasis_warp.adaptation.sh_lighting import match_exposure, match_light, split_albedo_shading
+from oasis_warp.adaptation.sh_lighting import match_light, split_albedo_shading
 from oasis_warp.adaptation.sharpen import sharpen
 from oasis_warp.adaptation.texture import Targets, learn_lora, learn_texture, make_targets, reference_azimuths
 from oasis_warp.adaptation.unlit import (
@@ -161,8 +161,6 @@ def adapt(
         trust = ((weight * photos.trust).sum(0) + UNSEEN) / (weight.sum(0) + UNSEEN)
         hand_share = shade_left(hand, crops[0].rest.vertices)[:, 0]
         gaussians = split_albedo_shading(hand, calibrated.colors, gaussians, trust, hand_share)
-        gaussians, lights = match_exposure(hand, gaussians, crops[0], photos.lights)
-        result = result._replace(lights=lights)
     return result._replace(gaussians=gaussians, losses=texture.losses)
 
 

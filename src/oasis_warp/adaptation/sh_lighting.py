@@ -7,8 +7,6 @@ keeps it and other poses lose it. Marks whose colours light cannot give to skin 
 does what is fine: a hand without pores, creases and relief looks like wax.
 """
 
-from collections.abc import Sequence
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -283,8 +281,6 @@ FINE_PASSES, FINE_PASSES_AT_WRIST = 60, 9
 """Smoothings over the mesh that leave the wide part, about 15 mm and 6 mm. With 9 everywhere, four photos of same_hand
 keep .65 of their contrast at 4-8 px in other poses, with 60 .72; but where the hand turns into the arm, wider folds are
 smears on a hand without its arm."""
-EXPOSURES = 0.7, 2.0
-"""Range of the gain of `match_exposure`; .9 to 1.6 on the photos of the tests."""
 MAX_FINE = 0.3
 """Largest fine part, as a logarithm; more is a sharp shadow, gloss, or another part of the hand."""
 ACROSS_SHADING = ((-18.0, 21.3, -7.5), (8.8, 4.6, -8.1))
@@ -325,38 +321,6 @@ def split_albedo_shading(
     albedo = read[:, 4:] * torch.lerp(beyond, skin, read[:, 3:4])
     colors = (guess.clamp_min(MIN_COLOR) * albedo.exp()).clamp(max=1)
     return learned._replace(colors=colors, shade=learned.colors.clamp_min(MIN_SHOWN) / colors)
-
-
-def match_exposure(
-    hand: HandModel, gaussians: CanonicalGaussians, crop: HandCrop, lights: Sequence[HandLight]
-) -> tuple[CanonicalGaussians, tuple[HandLight, ...]]:
-    """Scale all lights until the hand is as bright without shade as the photo shows it; colours in it stay.
-
-    The light is fitted to a guess that is calibrated in sRGB, and hard light on half of a hand makes its mean in linear
-    light larger than that: by up to a half, and less saturated. Without shade such hands were dark and orange.
-
-    Args:
-        hand: Model of the surface.
-        gaussians: With shade, in the light of the first photo.
-        crop: The first photo.
-        lights: Of all photos.
-    """
-    light, rest, faces = lights[0], crop.rest.vertices, hand.faces.to(crop.image.device)
-    if gaussians.shade is None or light.shade is None:
-        return gaussians, tuple(lights)
-    lit = shading(light, posed_lighting(rest, crop.posed.vertices, faces, light))
-    own, shade = (
-        vertex_colors(gaussians._replace(colors=values), len(rest)) for values in (gaussians.colors, gaussians.shade)
-    )
-    factors = lit, lit * shade * light.shade
-    seen = observe(hand, crop).confidence[:, None]  # in all pixels, as people see it: highlights, too
-    without, shown = ((seen * (own * each).clamp(0, 1) ** GAMMA).sum(0) for each in factors)
-    gain = (shown / without.clamp_min(1e-6)).clamp(*EXPOSURES)
-    scaled = tuple(
-        each._replace(harmonics=each.harmonics * gain, limits=each.limits * gain, even=each.even * gain)
-        for each in lights
-    )
-    return gaussians._replace(shade=gaussians.shade / gain ** (1 / GAMMA)), scaled
 
 
 def mark_probability(beyond: Float[Tensor, "V 3"]) -> Float[Tensor, "V 1"]:

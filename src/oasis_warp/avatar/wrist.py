@@ -51,7 +51,8 @@ ARM_STEP = 0.002
 FILL_STEP = 0.004
 """Distance of the balls that fill the arm [m]."""
 ARM_LAYERS, FILL_LAYERS = 2.5, 12.0
-"""Numbers of the arm's Gaussians and of balls one behind the other, each of them so much fainter."""
+"""Numbers of the arm's Gaussians and of balls one behind the other, each of them so much fainter. There are more balls,
+so the arm is opaque for 3 cm and then fades."""
 RIM_PARTS = -1 / 3, 0.0, 1 / 3
 """Places of Gaussians along the edges at a vertex of the rim, as shares of the edge: one on each vertex makes teeth."""
 RIM_SPREAD = 0.8
