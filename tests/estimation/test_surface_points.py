@@ -280,6 +280,10 @@ def test_a_photo_is_read_on_cuda_as_on_the_cpu(fitted):
     here, there, again = (
         read_pixels(photo.rgb.numpy(), xy, bundled_dense_network(device)) for device in ("cpu", "cuda", "cuda")
     )
-    for a, b, c in zip(vars(here).values(), vars(there).values(), vars(again).values(), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-3)  # TF32 is off by ten times as much
-        np.testing.assert_array_equal(b, c)
+    for name, read in vars(here).items():
+        first, second = vars(there)[name], vars(again)[name]
+        np.testing.assert_array_equal(first, second)
+        # Normals off the hand may be unit vectors of next to nothing.
+        where = np.s_[:, here.hand > 0.5] if name == "normal" else ...
+        a, b = (np.asarray(values)[where] for values in (read, first))
+        np.testing.assert_allclose(a, b, atol=3e-4, err_msg=name)  # TF32 is off by 1e-2
