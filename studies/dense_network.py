@@ -16,10 +16,11 @@ from torch import Tensor
 from oasis_warp.assets import asset
 from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.avatar.sky import harmonic_basis
+from oasis_warp.core.bands import split_bands
 from oasis_warp.core.types import Photo
 from oasis_warp.estimation.estimator import choose_hand
 from oasis_warp.estimation.pixel_reading import read_pixels
-from oasis_warp.evaluation.band_energy import contrasts, split_bands
+from oasis_warp.evaluation.band_energy import contrasts
 from oasis_warp.evaluation.views import RIM
 from oasis_warp.network.dense_network import HAND, DenseNetwork, DensePrediction, load_dense_network, read_dense_header
 from oasis_warp.pretraining.dense_trainer import DensePhotos, detected

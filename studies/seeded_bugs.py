@@ -57,7 +57,7 @@ PIPELINE = [
         "np.maximum(state.angles - self.high, 0)"),
     _of("estimation/refine", "estimation/test_surface_points", "step_that_was_taken", "the rotation reversed",
         "state.rotation @ self.start.rotation.T", "self.start.rotation @ state.rotation.T"),
-    _of("evaluation/band_energy", "evaluation/test_picture_metrics", "outline or beside", "what is not skin has weight",
+    _of("core/bands", "evaluation/test_picture_metrics", "outline or beside", "what is not skin has weight",
         "(values * weight)", "values"),
     _of("evaluation/kernel_distance", "evaluation/test_picture_metrics", "halves", "pairs of one hand counted",
         "return sums * (1 - np.eye(n_groups))", "return sums"),

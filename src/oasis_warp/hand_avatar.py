@@ -7,7 +7,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.avatar.pose import GAMMA, SurfaceLight, in_even_light, pose_gaussians, with_photo, with_self_occlusion
+from oasis_warp.avatar.pose import (
+    GAMMA,
+    SurfaceLight,
+    in_even_light,
+    mirror_surface_light,
+    pose_gaussians,
+    with_photo,
+    with_self_occlusion,
+)
 from oasis_warp.core.camera import camera_center
 from oasis_warp.core.color import plain_background
 from oasis_warp.core.config import BLACK, WHITE
@@ -111,7 +119,7 @@ class Avatar:
             camera = mirror_camera(source_camera) if left else source_camera
             center = camera_center(camera.viewmat.to(vertices))
             known = with_photo(light, self.rest.vertices, self._photo_surface(), self.hand.faces, gaussians, center)
-            self._light = _mirror_surface_light(known) if left else known
+            self._light = mirror_surface_light(known) if left else known
         self._fixed = *(part for part in self._canonical if part is not None), vertices, self._rest.joints
         self._source_angles = source_pose.angles.to(self.shape)
         self._graphs = GraphCache()
@@ -201,15 +209,14 @@ class Avatar:
             ValueError: a part of the pose has another shape or is not finite, or no pose has that name.
         """
         checked = self._checked(pose, validate)
-        center = None if camera is None else camera_center(self._checked_viewmat(camera, validate))
+        center = None
+        if camera is not None:
+            check_shape("camera.viewmat", camera.viewmat, 4, 4)
+            if validate:
+                check_finite(viewmat=camera.viewmat)
+            center = camera_center(camera.viewmat.to(self.shape))
         posed = self._resolve_contact(skin_surface(self._model, self._rest, checked), checked)
         return pose_gaussians(self._canonical, self.hand.faces, self._rest_mesh, posed, self._light, center)
-
-    def _checked_viewmat(self, camera: Camera, validate: bool) -> Float[Tensor, "4 4"]:
-        check_shape("camera.viewmat", camera.viewmat, 4, 4)
-        if validate:
-            check_finite(viewmat=camera.viewmat)
-        return camera.viewmat.to(self.shape)
 
     def render(
         self, camera: Camera, pose: HandPose | str, background: Color = WHITE, *, validate: bool = True
@@ -365,11 +372,6 @@ class Avatar:
         albedo = self._mean_albedo(self.light.even) if self.light.albedo is None else self.light.albedo
         light = with_self_occlusion(self.light, albedo, self.rest.vertices, self._photo_surface(), self.hand.faces)
         return self.with_looks(self.gaussians, light)
-
-
-def _mirror_surface_light(light: SurfaceLight) -> SurfaceLight:
-    view = None if light.photo_view is None else mirror_points(light.photo_view)
-    return light._replace(light=mirror_light(light.light), normals=mirror_points(light.normals), photo_view=view)
 
 
 def check_pose_type(pose: HandPose) -> None:

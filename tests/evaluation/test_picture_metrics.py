@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from oasis_warp.evaluation.band_energy import BANDS, KEPT, SIGMAS, SIZE, contrasts, log_brightness, split_bands
+from oasis_warp.core.bands import SIGMAS, split_bands
+from oasis_warp.evaluation.band_energy import BANDS, KEPT, SIZE, contrasts, log_brightness
 from oasis_warp.evaluation.kernel_distance import (
     LAYERS,
     Sample,

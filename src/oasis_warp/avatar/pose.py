@@ -10,6 +10,7 @@ from torch import Tensor
 from oasis_warp.avatar.anchors import vertex_to_gaussians
 from oasis_warp.avatar.sky import arriving, bounced, exposure, harmonic_basis, largest_nearby
 from oasis_warp.core import rotation, surface
+from oasis_warp.core.mirror import mirror_light, mirror_points
 from oasis_warp.core.types import CanonicalGaussians, Gaussians, HandLight
 from oasis_warp.ops import RestMesh, face_rotations, pose_mesh_gaussians
 from oasis_warp.ops.sky_exposure import sky_directions
@@ -69,6 +70,12 @@ class Lighting(NamedTuple):
     """As `sky.exposure`; None where the hand hides nothing of the light."""
 
 
+def mirror_surface_light(light: SurfaceLight) -> SurfaceLight:
+    """The same in the mirrored world."""
+    view = None if light.photo_view is None else mirror_points(light.photo_view)
+    return light._replace(light=mirror_light(light.light), normals=mirror_points(light.normals), photo_view=view)
+
+
 def posed_lighting(
     rest: Float[Tensor, "V 3"], posed: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], light: HandLight
 ) -> Lighting:
@@ -101,12 +108,8 @@ def with_photo(
     normals, end = surface.vertex_normals(rest, faces), None
     if canonical is not None:
         end = torch.nonzero(surface.open_vertices(faces, len(rest))[canonical.vertex_index])[:, 0]
-    if light.facing is None:
-        return SurfaceLight(light, normals, end=end)
-    view = None if center is None else view_direction(photo, center)
-    if light.albedo is None or light.shade is None:
-        return SurfaceLight(light, normals, None, end, view)
-    seen = posed_lighting(rest, photo, faces, light).exposure
+    view = None if center is None or light.facing is None else view_direction(photo, center)
+    seen = None if light.shade is None else posed_lighting(rest, photo, faces, light).exposure
     return SurfaceLight(light, normals, None if seen is None else seen[..., 0], end, view)
 
 

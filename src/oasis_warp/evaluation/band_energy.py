@@ -1,13 +1,10 @@
 """How much contrast skin has, by the size of its detail: what tells a hand from one of clay; and its blemishes.
 
-The logarithm of the luminance is split by differences of Gaussians. Each Gaussian is a normalised convolution (Knutsson
-and Westin 1993): the sum of the weighted values over the sum of the weights. So what lies outside of the skin adds
-nothing, its outline included. Blemishes spoil a hand at a glance: haze around it, wounds on an opened palm, and a back
-of another colour.
+The logarithm of the luminance is split by differences of Gaussians (`core.bands`), to which what lies outside of the
+skin adds nothing, its outline included. Blemishes spoil a hand at a glance: haze around it, wounds on an opened palm,
+and a back of another colour.
 """
 
-import functools
-import itertools
 from collections.abc import Sequence
 
 import torch
@@ -19,8 +16,6 @@ from oasis_warp.core.color import cielab, linear_light, luminance
 
 SIZE = 256
 """Side of the square pictures in which contrasts are measured [px]."""
-SIGMAS = (1.0, 2.0, 4.0, 8.0)
-"""Standard deviations of the Gaussians between the bands [px]."""
 BANDS = ("<1", "1-2", "2-4", "4-8")
 """Names of the bands: detail that a Gaussian of the larger sigma blurs and one of the smaller does not."""
 DARKEST = 0.002
@@ -41,12 +36,6 @@ def log_brightness(image: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W"]:
     return luminance(image.clamp(0, 1)).clamp_min(DARKEST).log()
 
 
-def split_bands(values: Float[Tensor, "H W"], weight: Float[Tensor, "H W"]) -> Float[Tensor, "4 H W"]:
-    """`values` in each of `BANDS`, where `weight` is not 0; what has no weight adds nothing."""
-    levels = [values, *(_smooth(values, weight, sigma) for sigma in SIGMAS)]
-    return torch.stack([fine - coarse for fine, coarse in itertools.pairwise(levels)])
-
-
 def contrasts(parts: Sequence[tuple[Float[Tensor, "4 H W"], Bool[Tensor, "H W"]]]) -> Contrasts | None:
     """Contrasts over some pixels of one or several pictures together; None of fewer than `MIN_PIXELS`.
 
@@ -58,19 +47,6 @@ def contrasts(parts: Sequence[tuple[Float[Tensor, "4 H W"], Bool[Tensor, "H W"]]
         return None
     kept = values.square().sort(1).values[:, : round(KEPT * values.shape[1])]
     return tuple(100 * value for value in kept.mean(1).sqrt().tolist())
-
-
-def _smooth(values: Tensor, weight: Tensor, sigma: float) -> Tensor:
-    rows, columns = (_gaussian(n, sigma).to(values) for n in values.shape)
-    total = rows @ weight @ columns
-    return (rows @ (values * weight) @ columns) / total.clamp_min(1e-12)
-
-
-@functools.cache
-def _gaussian(size: int, sigma: float) -> Float[Tensor, "n n"]:
-    """Weights of a Gaussian from each pixel of a line to each other; the normalised convolution scales them."""
-    x = torch.arange(size, dtype=torch.float64)
-    return torch.exp(-0.5 * ((x[:, None] - x) / sigma) ** 2)
 
 
 HAZE_REACH = 5

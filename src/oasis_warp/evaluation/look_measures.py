@@ -10,6 +10,7 @@ from torch import Tensor
 from oasis_warp.avatar.anchors import place_anchors
 from oasis_warp.avatar.appearance import label_regions
 from oasis_warp.avatar.quality import SEEN
+from oasis_warp.core.bands import split_bands
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.types import HandCrop, Photo, Render
 from oasis_warp.estimation.hand_crop import crop_hand
@@ -22,7 +23,6 @@ from oasis_warp.evaluation.band_energy import (
     log_brightness,
     mean_light,
     redness,
-    split_bands,
 )
 from oasis_warp.evaluation.kernel_distance import Sample, hand_features
 from oasis_warp.evaluation.pictures import Cell

@@ -9,9 +9,10 @@ from torch import Tensor
 
 from oasis_warp.avatar.anchors import OPACITY, place_anchors
 from oasis_warp.avatar.observation import inner_mask
+from oasis_warp.core.bands import split_bands
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.evaluation import band_energy
-from oasis_warp.evaluation.band_energy import BANDS, KEPT, SIZE, log_brightness, split_bands
+from oasis_warp.evaluation.band_energy import BANDS, KEPT, SIZE, log_brightness
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses import Perceptual, ssim_map
 from oasis_warp.ops import depth_map

@@ -12,11 +12,12 @@ from torch import Tensor
 
 from oasis_warp.assets import asset
 from oasis_warp.avatar.quality import SEEN
+from oasis_warp.core.bands import split_bands
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.types import HandCrop, Photo
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.estimation.hand_crop import crop_hand, crop_side, initial_offsets
-from oasis_warp.evaluation.band_energy import SIZE, contrasts, darkest_over_median, log_brightness, split_bands
+from oasis_warp.evaluation.band_energy import SIZE, contrasts, darkest_over_median, log_brightness
 from oasis_warp.evaluation.kernel_distance import hand_features
 from oasis_warp.evaluation.same_hand import photos_in
 from oasis_warp.evaluation.summary import Record

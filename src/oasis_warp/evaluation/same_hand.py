@@ -17,6 +17,7 @@ from oasis_warp import __version__
 from oasis_warp.avatar.appearance import label_regions, region_masks
 from oasis_warp.avatar.observation import Observation, inner_mask, observe
 from oasis_warp.avatar.prior import Prior
+from oasis_warp.core.bands import split_bands
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
@@ -25,7 +26,7 @@ from oasis_warp.data.output_files import open_resumable_folder, write_file
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.estimation.hand_crop import crop_hand, initial_offsets
-from oasis_warp.evaluation.band_energy import BANDS, SIZE, Contrasts, contrasts, log_brightness, split_bands
+from oasis_warp.evaluation.band_energy import BANDS, SIZE, Contrasts, contrasts, log_brightness
 from oasis_warp.evaluation.methods import EVEN, KEEP, ONE_SHOT, RAW, Method, method_name, prior_digest
 from oasis_warp.evaluation.metrics import COVERED, color_gain
 from oasis_warp.evaluation.pictures import tile, write_sheet, write_strip

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import cross_entropy
 
+from oasis_warp.core.bands import split_bands
 from oasis_warp.network.dense_network import (
     DEPTHS,
     HAND,
@@ -31,8 +32,6 @@ WEIGHTS = {
     "classes": 1.0, "surface": 0.3, "normal": 0.5, "albedo": 2.0, "edges": 1.0, "contrast": 0.03, "finger": 0.1,
 }  # fmt: skip
 """Weights of the terms of the loss."""
-SIGMAS = (1.0, 2.0, 4.0, 8.0)
-"""Standard deviations of the Gaussians between the bands of the term `contrast` [px]."""
 LEAST_CONTRAST, DARKEST = 1e-3, 0.02
 """Least contrast of a band that counts, and the darkest albedo, encoded as sRGB."""
 FEWEST = 400
@@ -107,23 +106,13 @@ def _contrast_gap(predicted: Float[Tensor, "B 3 H W"], true: Tensor, skin: Float
     contrasts = [_contrasts(values.clamp_min(DARKEST).log().mean(1), skin) for values in (predicted, true)]
     first, second = (values.clamp_min(LEAST_CONTRAST).log() for values in contrasts)
     counts = (skin.sum((1, 2)) >= FEWEST).float()[:, None]
-    return ((first - second).abs() * counts).sum() / (counts.sum() * len(SIGMAS)).clamp_min(1)
+    return ((first - second).abs() * counts).mean(1).sum() / counts.sum().clamp_min(1)
 
 
 def _contrasts(values: Float[Tensor, "B H W"], skin: Float[Tensor, "B H W"]) -> Float[Tensor, "B 4"]:
-    """Mean magnitude of the differences of Gaussians on the skin; what lies beside it adds nothing."""
-    levels = [values]
-    for sigma in SIGMAS:
-        rows, columns = (_gaussian(n, sigma, values) for n in values.shape[1:])
-        levels.append((rows @ (values * skin) @ columns) / (rows @ skin @ columns).clamp_min(1e-6))
-    bands = torch.stack([fine - coarse for fine, coarse in itertools.pairwise(levels)], 1)
-    return (bands.abs() * skin[:, None]).sum((2, 3)) / skin.sum((1, 2)).clamp_min(1)[:, None]
-
-
-def _gaussian(size: int, sigma: float, like: Tensor) -> Float[Tensor, "n n"]:
-    """Weights of a Gaussian from each pixel of a line to each other."""
-    x = torch.arange(size, device=like.device, dtype=like.dtype)
-    return torch.exp(-0.5 * ((x[:, None] - x) / sigma) ** 2)
+    """Mean magnitude of each band on the skin."""
+    magnitude = split_bands(values, skin).abs() * skin[:, None]
+    return magnitude.sum((2, 3)) / skin.sum((1, 2)).clamp_min(1)[:, None]
 
 
 def _neighbours(values: Tensor, axis: int) -> tuple[Tensor, Tensor]:
