@@ -118,7 +118,7 @@ class Avatar:
         if light is not None:
             camera = mirror_camera(source_camera) if left else source_camera
             center = camera_center(camera.viewmat.to(vertices))
-            known = with_photo(light, self.rest.vertices, self._photo_surface(), self.hand.faces, gaussians, center)
+            known = with_photo(light, self.rest.vertices, self._photo_surface(), self.hand.faces, center)
             self._light = mirror_surface_light(known) if left else known
         self._fixed = *(part for part in self._canonical if part is not None), vertices, self._rest.joints
         self._source_angles = source_pose.angles.to(self.shape)

@@ -249,18 +249,20 @@ def test_the_arm_fades_from_the_rim_on_and_hides_the_cap_along_it(hand, hands):
     assert seen[0] > 0.95 and 0.5 < seen[1] < 0.95 and seen[2] < 0.3
 
 
-def test_light_falls_on_the_cap_as_on_a_rounded_end(hand, hands):
-    """It came with the rim's vertices, whose sides made wedges; then the cap was a flat, even disk."""
+def test_light_falls_on_the_arm_as_on_the_skin_before_it(hand, hands):
+    """It came by the arm's own normals, which are not those of a wrist that narrows: a line around the wrist."""
     rest, _, after = hands
     above = torch.tensor([[1.0], [0.0], [0.8], [0.0]]).expand(4, 3)
     lamp = HandLight(above, torch.tensor([[0.1] * 3, [3.0] * 3]), torch.ones(3))
-    lit = pose_gaussians(after, hand.faces, rest, rest, with_photo(lamp, rest, rest, hand.faces, after)).colors
-    end = torch.nonzero(torch.isin(after.vertex_index, hand.rim))[:, 0]
-    normals = rotation.to_matrix(after.quats[end])[:, :, 2]
-    expected = (1 + 0.8 * normals[:, 1]).clamp(0.1, 3) ** (1 / 2.2)
-    factor = (lit / after.colors)[end]
-    bright = lit[end].amax(1) < 1
-    torch.testing.assert_close(factor[bright], expected[bright, None].expand(-1, 3), rtol=1e-4, atol=1e-4)
+    lit = pose_gaussians(after, hand.faces, rest, rest, with_photo(lamp, rest, rest, hand.faces)).colors
+    factor, at = (lit / after.colors)[:, 0], centers(hand, rest, after)
+    arm = arm_of(hand, rest, after)
+    arm = arm[torch.cdist(at[arm], rest[hand.rim]).amin(1) < 0.003]
+    skin = torch.ones(len(at), dtype=torch.bool)
+    skin[: len(after.vertex_index)] = ~torch.isin(after.vertex_index, hand.rim)
+    apart, nearest = torch.cdist(at[arm], at[skin]).min(1)
+    assert apart.max() < 0.006 and factor[arm].max() > 1.4 * factor[arm].min()
+    assert (factor[arm] / factor[skin][nearest]).log().abs().median() < 0.02
 
 
 def test_the_cap_goes_on_from_the_skin_without_an_edge(hand, hands):

@@ -55,8 +55,6 @@ class SurfaceLight(NamedTuple):
     """Unit normals of the surface at rest."""
     seen: Float[Tensor, "V"] | None = None
     """Share of the sky that each vertex saw in the photo; None where no shade depends on it."""
-    end: Int[Tensor, "E"] | None = None
-    """The Gaussians on the wrist's rim, which close it: light falls on them by their own normals."""
     photo_view: Float[Tensor, "3"] | None = None
     """Unit direction from the middle of the hand to the photo's camera; None where the view changes no colour."""
 
@@ -97,20 +95,15 @@ def with_photo(
     rest: Float[Tensor, "V 3"],
     photo: Float[Tensor, "V 3"],
     faces: Int[Tensor, "F 3"],
-    canonical: CanonicalGaussians | None = None,
     center: Float[Tensor, "3"] | None = None,
 ) -> SurfaceLight:
     """`light` on a surface, given its vertices at rest and in the photo that the light's shade is of.
 
-    With the Gaussians, if those on the wrist's rim close it. With the `center` of the photo's camera, for pictures from
-    other sides.
+    With the `center` of the photo's camera, for pictures from other sides.
     """
-    normals, end = surface.vertex_normals(rest, faces), None
-    if canonical is not None:
-        end = torch.nonzero(surface.open_vertices(faces, len(rest))[canonical.vertex_index])[:, 0]
     view = None if center is None or light.facing is None else view_direction(photo, center)
     seen = None if light.shade is None else posed_lighting(rest, photo, faces, light).exposure
-    return SurfaceLight(light, normals, None if seen is None else seen[..., 0], end, view)
+    return SurfaceLight(light, surface.vertex_normals(rest, faces), None if seen is None else seen[..., 0], view)
 
 
 def view_direction(vertices: Float[Tensor, "*B V 3"], center: Float[Tensor, "3"]) -> Float[Tensor, "*B 3"]:
@@ -205,15 +198,6 @@ def shading_factors(
     return read[..., :3] * (1 + torch.lerp(read[..., 4:], read[..., 3:4], deep) * beyond)
 
 
-def _end_factors(
-    canonical: CanonicalGaussians, quats: Float[Tensor, "*B N 4"], light: HandLight, on: Lighting, end: Int[Tensor, "E"]
-) -> Float[Tensor, "*B E 3"]:
-    """The same of vertex Gaussians by the normals of their own discs, past what is hidden of their vertices."""
-    normals = rotation.to_matrix(quats.index_select(-2, end))[..., 2]
-    seen = None if on.exposure is None else on.exposure.index_select(-2, canonical.vertex_index[end])
-    return shading(light, Lighting(normals, seen))
-
-
 def _at_gaussians(
     of_vertices: Float[Tensor, "*B V D"], faces: Int[Tensor, "F 3"], canonical: CanonicalGaussians
 ) -> Float[Tensor, "*B N D"]:
@@ -306,7 +290,5 @@ def pose_gaussians(
         if center is not None and light.photo_view is not None:
             viewed = view_share(light.photo_view, view_direction(posed_vertices, center))
         factors = shading_factors(canonical, faces, light.light, on, light.seen, viewed)
-        if light.end is not None:
-            factors = factors.index_copy(-2, light.end, _end_factors(canonical, quats, light.light, on, light.end))
         colors = (colors * factors).clamp(0, 1)
     return Gaussians(means, quats, scales, canonical.opacities, colors)

@@ -35,19 +35,21 @@ CAP_RINGS = 20
 """Steps of the cap's rings from the rim to its middle: 1.5 mm, closer than the skin's vertices."""
 MIRRORED = 0.05
 """The stretch of skin before the rim whose detail the end of the wrist repeats in the mirror [m]."""
-AVERAGED = 32
-"""Number of nearest Gaussians of that skin, 3 to 6 mm around; detail is the difference of one from their mean."""
+AVERAGED = 200
+"""Number of nearest Gaussians of that skin, 8 mm around; detail is the difference of one from their mean. With 32 the
+blotches of a back ended at the rim."""
 DARKEST = 0.02
 """Colours are clamped to it before their logarithm is taken [sRGB]."""
-CONTRAST = 0.03
-"""Largest standard deviation of that detail's logarithm, the finest contrast of real palms: more is the edge of a
-shadow or of a sleeve."""
+CONTRAST = 0.045
+"""Largest standard deviation of that detail's logarithm, what palms have from one to four pixels of 256: more is the
+edge of a shadow or of a sleeve."""
 ARM_LENGTH = 0.06
 """The stretch past the rim over which an arm fades out [m]: a hand that ends at once looks sawn off."""
 ARM_GROWTH = 0.1
 """How much wider the arm is at its end than at the rim."""
-ARM_STEP = 0.002
-"""Distance of the arm's Gaussians [m], that of the skin's vertices."""
+ARM_STEP, COARSER = 0.001, 3.0
+"""Distance of the arm's Gaussians at the rim [m], half of that of the skin's vertices, and how much larger it is at the
+end: with 2 mm the skin's detail ended at the rim."""
 FILL_STEP = 0.004
 """Distance of the balls that fill the arm [m]."""
 ARM_LAYERS, FILL_LAYERS = 2.5, 12.0
@@ -223,10 +225,14 @@ def fading_arm(
     """
     edge, axis = rest[rim], rim_axis(rest, rim)
     radius = float((edge - edge.mean(0)).norm(dim=1).mean())
-    walls = [(k * ARM_STEP / ARM_LENGTH, 1.0, ARM_STEP) for k in range(1, round(ARM_LENGTH / ARM_STEP))]
+    n_walls = round(ARM_LENGTH / ARM_STEP * math.log(COARSER) / (COARSER - 1))
+    coarser = [COARSER ** (k / n_walls) for k in range(1, n_walls)]
+    walls = [((ratio - 1) / (COARSER - 1), 1.0, ratio * ARM_STEP) for ratio in coarser]
     sections = [CAP_HEIGHT + k * FILL_STEP for k in range(1, round((ARM_LENGTH - CAP_HEIGHT) / FILL_STEP))]
-    n_rings = round(radius / FILL_STEP)
-    fill = [(height / ARM_LENGTH, (k + 0.5) / n_rings, FILL_STEP) for height in sections for k in range(n_rings)]
+    inner = radius - FILL_STEP  # the balls would blur the arm's outline
+    n_rings = round(inner / FILL_STEP)
+    places = [(k + 0.5) / n_rings * inner / radius for k in range(n_rings)]
+    fill = [(height / ARM_LENGTH, place, FILL_STEP) for height in sections for place in places]
     index, offsets, normals, tangents, scales, opacities = [], [], [], [], [], []
     for k, (share, out, length) in enumerate(walls + fill):
         rows, arm, outward, tangent = _ring(edge, axis, length / out, 0.5 * (k % 2))

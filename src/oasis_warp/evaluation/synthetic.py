@@ -254,7 +254,7 @@ def draw_targets(
         else:
             turn = rotations[k].to(rest)
             photo, seen_from = batch.posed[0] @ turn.T, turn @ camera_center(batch.viewmat[0])
-            light = with_photo(rotate_light(made.light, turn), rest, photo, hand.faces, made.gaussians, seen_from)
+            light = with_photo(rotate_light(made.light, turn), rest, photo, hand.faces, seen_from)
             posed_gaussians = pose_gaussians(made.gaussians, hand.faces, rest, posed, light, camera_center(viewmat))
         images.append(render(posed_gaussians, Camera(viewmat, K, size, size)).image)
     return images

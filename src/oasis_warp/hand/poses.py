@@ -32,10 +32,10 @@ Thumb = tuple[float, float, float, float, float]
 """Flexion, abduction and twist of the thumb's base, flexion of its two outer joints [degrees]."""
 
 _FIST: dict[str, Finger] = {
-    "index": (79, 98, 64, 4),
-    "middle": (82, 95, 63, 1),
-    "ring": (81, 98, 64, -1),
-    "little": (79, 94, 57, -5),
+    "index": (78, 110, 58, -4),
+    "middle": (86, 110, 59, -2),
+    "ring": (79, 110, 62, 4),
+    "little": (71, 108, 64, 6),
 }
 
 # Flexion is relative to a straight finger. Abduction, and all angles of the thumb's base, are relative to rest and
@@ -44,11 +44,11 @@ _FIST: dict[str, Finger] = {
 _THUMBS: dict[str, Thumb] = {
     "open": (-10, 14, 0, 0, 0),
     "relaxed": (8, -4, 0, 14, 16),
-    "fist": (25, 15, -10, 28, 73),
+    "fist": (30, 14, -14, 42, 70),
     "pinch": (35, 10, -10, 2, 5),
     "thumbs_up": (-12, 18, 0, 12, -16),
-    "victory": (38, 21, -16, 40, 45),
-    "point": (20, 22, -23, 44, 49),
+    "victory": (45, 15, -18, 37, 44),
+    "point": (35, 17, -18, 43, 61),
     "ok": (32, 10, -11, 13, 12),
 }
 

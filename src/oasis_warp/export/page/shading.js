@@ -12,20 +12,11 @@ const THROUGH_SKIN = [0.15, 0.07, 0.04]; // light that reaches skin which sees n
 const WEAK = 0.3, DEEP = 0.6; // differences of shade from 1, up to which it is the skin's own, and from which it is not
 const MAP_SEEN = [0.36, 0.6, 0.57], MAP_INVENTED = [0.89, 0.55, 0.28], MAP_SKIN = 0.35; // colours of the map; share of skin in it
 
-function makeShading(body, gaussians) {
-  const { rim, quats } = body.data.arrays, onRim = new Set(rim), { corners, nOnVertices, count } = gaussians;
-  const lit = corners.slice(), ends = []; // lit: whose factors each Gaussian has; those that close the wrist have their own
-  for (let i = 0; i < nOnVertices; i++) {
-    if (!onRim.has(corners[3 * i])) continue;
-    const m = rotationMatrix(quats, 4 * i);
-    lit.fill(body.nVertices + ends.length, 3 * i, 3 * i + 3);
-    ends.push({ vertex: corners[3 * i], normal: [m[2], m[5], m[8]] });
-  }
-  const size = body.nVertices + ends.length;
+function makeShading(body, { count }) {
+  const n = body.nVertices;
   return {
-    normals: new Float32Array(3 * body.nVertices), factors: new Float32Array(4 * size), lit, ends,
-    change: new Float32Array(body.nVertices), nearby: new Float32Array(body.nVertices), deep: new Float32Array(size),
-    colors: new Uint32Array(count), sky: makeSky(body),
+    normals: new Float32Array(3 * n), factors: new Float32Array(4 * n), change: new Float32Array(n), nearby: new Float32Array(n),
+    deep: new Float32Array(n), colors: new Uint32Array(count), sky: makeSky(body),
   };
 }
 
@@ -54,7 +45,7 @@ function viewShare({ data, posed, nVertices }, eye) {
 // of deep shade into shading.deep: for it, and where the photo is in doubt, the change of the sky is the largest nearby.
 // Deep shade also ends with the photo's pose, on all of the hand at once. Of both the share `viewed` is seen.
 function lightVertices(body, shading, light, viewed) {
-  const { shade, facing, doubt } = body.data.arrays, { normals, factors, sky, change, nearby, deep, ends } = shading, { albedo, seen } = light;
+  const { shade, facing, doubt } = body.data.arrays, { normals, factors, sky, change, nearby, deep } = shading, { albedo, seen } = light;
   const bounce = albedo && albedo.map((a) => [2.0404 * a - 0.3324, -4.7951 * a + 0.6417, 2.7552 * a + 0.6903]);
   const keptAt = (v) => {
     const a = 3 * v;
@@ -70,45 +61,41 @@ function lightVertices(body, shading, light, viewed) {
     const same = mixed(SAME_SKY, SAME_BESIDE), other = mixed(OTHER_SKY, OTHER_BESIDE);
     const left = (moved) => viewed * (albedo && seen ? kept * (1 - between(moved, same, other)) : kept);
     deep[v] = held * left(nearby[v]);
-    lightPlace(light, bounce, x, y, z, sky.exposure, 4 * v, factors, 4 * v);
+    lightVertex(light, bounce, x, y, z, sky.exposure, factors, 4 * v);
     if (shade) for (let c = 0; c < 3; c++) factors[4 * v + c] *= 1 + deep[v] * (shade[3 * v + c] - 1);
     factors[4 * v + 3] = left(mixed(change[v], nearby[v]));
   }
-  ends.forEach(({ vertex, normal }, k) => {
-    const [x, y, z] = turned(rotationMatrix(body.quats, 4 * vertex), normal);
-    lightPlace(light, bounce, x, y, z, sky.exposure, 4 * vertex, factors, 4 * (body.nVertices + k));
-  });
 }
 
 // Factors of colours that face (x, y, z), past what is hidden of the light there.
-function lightPlace({ harmonics: h, limits }, bounce, x, y, z, exposure, from, out, to) {
+function lightVertex({ harmonics: h, limits }, bounce, x, y, z, exposure, factors, at) {
   const xy = x * y, yz = y * z, zz = 3 * z * z - 1, xz = x * z, xx = x * x - y * y;
   for (let c = 0; c < 3; c++) {
     let got = h[c] + h[3 + c] * x + h[6 + c] * y + h[9 + c] * z + h[12 + c] * xy + h[15 + c] * yz + h[18 + c] * zz +
       h[21 + c] * xz + h[24 + c] * xx;
     got = Math.min(Math.max(got, limits[c]), limits[3 + c]);
     if (bounce) {
-      const e = exposure[from + 1 + c], [p, q, r] = bounce[c];
+      const e = exposure[at + 1 + c], [p, q, r] = bounce[c];
       got *= THROUGH_SKIN[c] + (1 - THROUGH_SKIN[c]) * Math.max(e, ((e * p + q) * e + r) * e); // bounces: Jimenez et al. 2016
     }
-    out[to + c] = got ** (1 / GAMMA);
+    factors[at + c] = got ** (1 / GAMMA);
   }
 }
 
 // Colours and opacities of all Gaussians, a byte each, into shading.colors. `light` is null for even light.
 function colorGaussians(body, gaussians, shading, light) {
-  const { colors: own, fineShade, even } = body.data.arrays, { count, shares, heaviest, shown, opacities } = gaussians;
-  const { factors, colors, deep, lit } = shading;
+  const { colors: own, fineShade, even } = body.data.arrays, { count, corners, shares, heaviest, shown, opacities } = gaussians;
+  const { factors, colors, deep } = shading;
   for (let i = 0; i < count; i++) {
     if (!shown[heaviest[i]]) continue;
     const a = 3 * i, p = shares[a], q = shares[a + 1], r = shares[a + 2];
-    const u = 4 * lit[a], v = 4 * lit[a + 1], w = 4 * lit[a + 2];
+    const u = 4 * corners[a], v = 4 * corners[a + 1], w = 4 * corners[a + 2];
     let stays = 0;
     if (light && fineShade) {
       const red = Math.abs(fineShade[a] - 1), green = Math.abs(fineShade[a + 1] - 1), blue = Math.abs(fineShade[a + 2] - 1);
       const share = between(Math.max(red, green, blue), WEAK, DEEP);
       stays = (1 - share) * (p * factors[u + 3] + q * factors[v + 3] + r * factors[w + 3]) +
-        share * (p * deep[lit[a]] + q * deep[lit[a + 1]] + r * deep[lit[a + 2]]);
+        share * (p * deep[corners[a]] + q * deep[corners[a + 1]] + r * deep[corners[a + 2]]);
     }
     let packed = Math.round(255 * opacities[i]) << 24;
     for (let c = 0; c < 3; c++) {
