@@ -18,15 +18,17 @@ import torch
 from scipy.sparse.linalg import splu
 
 from oasis_warp.adaptation.inpainting import laplacian_and_mass
-from oasis_warp.adaptation.skin_detail import FORM_UNIT
+from oasis_warp.adaptation.skin_detail import FINER, FORM_UNIT
 from oasis_warp.avatar.appearance import label_regions
 from oasis_warp.avatar.wrist import shade_left
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.surface import mesh_edges, smooth_over_mesh
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.synthetic.body import bundled_body
+from oasis_warp.synthetic.atlas import bundled_atlas
+from oasis_warp.synthetic.body import FINGERS, bundled_body
 from oasis_warp.synthetic.identity import Population, sample_identity
 from oasis_warp.synthetic.people import relief_forms
+from oasis_warp.synthetic.skin_lines import Strokes, arc
 from oasis_warp.synthetic.skin_plan import plan_skin
 from oasis_warp.synthetic.skin_texture import nail_maps
 from oasis_warp.synthetic.texels import draw_lines, texels_on
@@ -62,15 +64,23 @@ the pictures' palms are blotches."""
 PALM_CONTRAST, FLAT, PALM_LOUDEST, EVENINGS = 0.04, 0.012, 0.08, 2
 """Root mean square of the logarithms of a palm's detail, contrast below which skin is left smoother, and what this
 detail tends to; how often it is divided by its contrast and limited. Set by eye, as the blurs, on drawn hands."""
+WIDE_ON_BACK, LESS_ON_BACK = 4.0, 0.6
+"""Blur [texels] of what is wide on backs, 2 mm and on fingers 4, and how much of it is taken off: it is what light and
+pigment of these three hands, and on others stains."""
 ON_PADS = 0.7
 """Contrast of the palm's side of fingers over that of palms, by eye: with 1 fingers look mottled."""
 RIM = 3.0
 """Width of the islands' rims over which detail fades in: what lies beside them bled into them [texels]."""
 GREY, STEPS = 128, 400
 """Value of the maps that stands for none, and steps to one of the natural logarithm."""
-PEOPLE, PALMS, LOUDEST_LINE = (3, 8), (4, 9), 2.0
-"""People of the synthetic world whose folds over the joints are taken, and the first one's veins; those whose palm's
-lines are taken; the strength of a line that is stored as 255. The photos' own lines are blurred."""
+PEOPLE, LOUDEST_LINE = (4, 9), 2.0
+"""People of the synthetic world whose palm's lines are taken, and the first one's veins; the strength of a line that is
+stored as 255. The photos' own lines are blurred."""
+FOLDS = {1: (6, 6.5, 1.6), 2: (3, 2.2, 1.3)}
+"""Number of folds over a finger's middle and end joint, how far from it they lie [mm], and their greatest strength."""
+FOLD_ANGLE, FOLD_BOW = 0.95, -1.6
+"""Half of what the longest fold covers around the finger [rad], and how far the ends of the outermost ones bend back
+towards the joint [mm/rad^2]."""
 PALM_LINES = {"crease": 1.4, "main": 1.35, "minor": 0.7, "wrinkle": 0.5, "halo": 0.3}
 """How dark lines of the palm are, in units of a clear fold: as the synthetic world draws them, halved by sRGB. More and
 darker fine lines looked like a hairy rash to strangers."""
@@ -105,19 +115,23 @@ def main(folder: Path) -> None:
     for k, detail in enumerate(details):
         stored = np.rint(GREY + STEPS * LOUDEST * np.tanh(detail / LOUDEST)).clip(0, 255).astype(np.uint8)
         write(target / f"detail_{k}.png", spread_out(stored, faces >= 0))
-    folds = [lines_on_back(hand, number) for number in PEOPLE]
-    palms = [lines_on_palm(hand, number) for number in PALMS]
-    drawn = [fold["fold"] + palm for fold, palm in zip(folds, palms, strict=True)]
-    lines = 255 * resampled(torch.stack([*drawn, folds[0]["vein"]], 1) / LOUDEST_LINE, faces, places)
-    lines *= 1 - (1 - LINES_ON_PADS) * share
-    before_wrist = shade_left(hand, hand.template)[:, 0]  # Gaussians stay coarse there, and thin lines would be dots
-    lines *= on_texels(before_wrist, hand, faces, places)[..., None]
-    write(target / "lines.png", spread_out(np.rint(np.clip(lines, 0, 255)).astype(np.uint8), faces >= 0, fill=0))
     write(target / "nails.png", spread_out(nails(hand, faces, places), faces >= 0))
+    write_lines(hand, target / "lines.png")
     write_relief(hand, target / "relief.npz")
     maps = sorted([*target.glob("*.png"), *target.glob("*.npz")])
     sums = [f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.name}" for path in maps]
     (target / "SHA256").write_text("\n".join(sums) + "\n")
+
+
+def write_lines(hand: HandModel, path: Path) -> None:
+    """The drawn lines of two persons and one person's veins."""
+    faces, places = rasterize(FINER * texel_corners(hand), FINER * BOX[3], FINER * BOX[2])
+    drawn = [knuckle_folds(number) + lines_on_palm(hand, number) for number in PEOPLE]
+    lines = 255 * resampled(torch.stack([*drawn, veins(hand)], 1) / LOUDEST_LINE, faces, places)
+    lines *= 1 - (1 - LINES_ON_PADS) * finger_pads(hand, faces, places, FINER)[..., None]
+    before_wrist = shade_left(hand, hand.template)[:, 0]  # Gaussians stay coarse there, and thin lines would be dots
+    lines *= on_texels(before_wrist, hand, faces, places)[..., None]
+    write(path, spread_out(np.rint(np.clip(lines, 0, 255)).astype(np.uint8), faces >= 0, fill=0))
 
 
 def write_relief(hand: HandModel, path: Path) -> None:
@@ -212,13 +226,14 @@ def even_palm(hand: HandModel, detail: np.ndarray, faces: np.ndarray, places: np
         fine = PALM_CONTRAST * fine / np.hypot(contrast, FLAT)
         fine = PALM_LOUDEST * np.tanh(fine / PALM_LOUDEST)
     fine *= 1 - (1 - ON_PADS) * pads[..., None]
+    detail = detail - LESS_ON_BACK * around(detail, WIDE_ON_BACK)
     return np.where(on[..., None], detail + palm[..., None] * (fine - detail), 0)
 
 
-def finger_pads(hand: HandModel, faces: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Share of the palm's side of fingers in each texel, [H, W]."""
+def finger_pads(hand: HandModel, faces: np.ndarray, places: np.ndarray, finer: int = 1) -> np.ndarray:
+    """Share of the palm's side of fingers in each texel, [H, W]; texels may be so many times finer."""
     finger = on_texels((hand.segment > 0).double(), hand, faces, places)
-    return cv2.GaussianBlur(finger, (0, 0), PAD_RIM) * on_texels(label_regions(hand).palm, hand, faces, places)
+    return cv2.GaussianBlur(finger, (0, 0), finer * PAD_RIM) * on_texels(label_regions(hand).palm, hand, faces, places)
 
 
 def on_texels(values: torch.Tensor, hand: HandModel, faces: np.ndarray, places: np.ndarray) -> np.ndarray:
@@ -241,11 +256,30 @@ def light_around_bones(hand: HandModel, colors: np.ndarray) -> np.ndarray:
     return splu((sparse.diags_array(mass) + SMOOTH**2 * laplacian).tocsc()).solve(mass[:, None] * fitted)
 
 
-def lines_on_back(hand: HandModel, number: int) -> dict[str, torch.Tensor]:
-    """The lines of one person of the synthetic world, clear ones, at its texels; none on the palm."""
-    person = sample_identity(hand, 0, number, Population(hair=0))._replace(knuckles=1.1, age=0.45)
-    lines = draw_lines(plan_skin(person).lines, texels_on("cpu").grid)
-    return {name: line * (1 - palm_share()) for name, line in lines.items()}
+def veins(hand: HandModel) -> torch.Tensor:
+    """The veins of one person of the synthetic world, at its texels; none on the palm."""
+    person = sample_identity(hand, 0, PEOPLE[0], Population(hair=0))
+    return draw_lines(plan_skin(person).lines, texels_on("cpu").grid)["vein"] * (1 - palm_share())
+
+
+def knuckle_folds(seed: int) -> torch.Tensor:
+    """How dark the folds over the joints of fingers are, at the synthetic world's texels.
+
+    Arcs around the middle of each joint, 2 mm apart. The world's own are 1.2 mm apart: Gaussians of 1 mm blur them
+    into a stain.
+    """
+    atlas, strokes = bundled_atlas(), Strokes(np.random.default_rng([seed]))
+    u = strokes.rng.uniform
+    for finger, name in enumerate(FINGERS):
+        for place, (count, reach, strength) in FOLDS.items():
+            bone = bundled_body().bones[finger][place]
+            for t in np.linspace(-1, 1, count):
+                half = FOLD_ANGLE * np.sqrt(1.15 - t**2) * u(0.75, 1.1)
+                angles = strokes.rng.normal(0, 0.08) + np.linspace(-half, half, 16)
+                at = reach * t + strokes.rng.normal(0, 0.25) - (place == 1)
+                line = arc(atlas, name, bone, at, angles, 8.0, FOLD_BOW * t + strokes.rng.normal(0, 0.4))
+                strokes.add("fold", line, u(0.4, 0.5), strength * u(0.7, 1.0), taper=0.3, wobble=0.35)
+    return draw_lines(strokes.lines(), texels_on("cpu").grid)["fold"] * (1 - palm_share())
 
 
 def lines_on_palm(hand: HandModel, number: int) -> torch.Tensor:

@@ -25,6 +25,9 @@ GREY, UNIT = 128, 400
 """Value of the detail maps that stands for none, and steps to one of the natural logarithm."""
 LOUDEST_LINE = 2.0
 """Strength of a line that is stored as 255."""
+FINER = 3
+"""Texels of the drawn lines in one of the other maps along each side: those are .45 mm wide on palms and 1 mm on
+fingers, whose folds they blur into a stain."""
 BOX, BODY = (732, 1621, 411, 412), 2048
 """Column, row, width and height of the maps in the texture of the whole body, and that one's side [px]."""
 LOW, SPAN = (0.361408, 0.011539), 0.192729
@@ -78,13 +81,14 @@ def sample_detail(hand: HandModel, gaussians: CanonicalGaussians | Places, seed:
     read = torch.cat([on_points, on_faces])
     place, share, shift = read.split([2, HANDS, 2], 1)
     share = share.square() / share.square().sum(1, keepdim=True)
-    maps = _maps().to(device)
+    maps, lines = (part.to(device) for part in _maps())
     moved = _sample(maps[: 3 * HANDS], place + shift).unflatten(1, (HANDS, 3))
-    own = _sample(maps[3 * HANDS :], place)  # not moved: lines and nails belong to their joints
-    plate, bare = own[:, 3], 1 - own[:, 3:4]
-    fold = torch.lerp(own[:, 0], own[:, 1], share[:, 0])
+    plate, pale, rim = _sample(maps[3 * HANDS :], place).unbind(1)  # not moved: nails and lines belong to their joints
+    one, other, vein = _sample(lines, FINER * place).unbind(1)
+    bare = 1 - plate
+    fold = torch.lerp(one, other, share[:, 0])
     skin = (moved * share[..., None]).sum(1)
-    return SkinDetail(skin * bare, fold * bare[:, 0], own[:, 2], plate, own[:, 4], own[:, 5])
+    return SkinDetail(skin * bare[:, None], fold * bare, vein, plate, pale, rim)
 
 
 @functools.lru_cache(2)
@@ -122,8 +126,8 @@ def _sample(maps: Float[Tensor, "C H W"], place: Float[Tensor, "N 2"]) -> Float[
 
 
 @functools.cache
-def _maps() -> Float[Tensor, "C H W"]:
-    """The detail of all hands, then two persons' folds, veins, and plate, paleness and rim of nails."""
+def _maps() -> tuple[Float[Tensor, "C H W"], Float[Tensor, "3 h w"]]:
+    """The detail of all hands with plate, paleness and rim of nails, and two persons' folds with one person's veins."""
 
     def read(name: str) -> np.ndarray:
         stored = np.frombuffer(asset("skin", name).read_bytes(), np.uint8)
@@ -134,7 +138,9 @@ def _maps() -> Float[Tensor, "C H W"]:
     detail = [(read(f"detail_{k}.png") - GREY) / UNIT for k in range(HANDS)]
     lines = read("lines.png") * (LOUDEST_LINE / 255)
     nails = (read("nails.png") - np.float32([0, GREY, 0])) / np.float32([255, 127, 255])
-    return torch.from_numpy(np.concatenate([*detail, lines, nails], 2)).permute(2, 0, 1).contiguous()
+    channels = np.concatenate([*detail, nails], 2), lines
+    maps, fine = (torch.from_numpy(values).permute(2, 0, 1).contiguous() for values in channels)
+    return maps, fine
 
 
 FORM_UNIT = 0.02
@@ -151,9 +157,9 @@ WIDE, WIDE_PASSES = 1.3, 6
 """How much more the wide part of a back's relief adds, and the smoothings over the mesh that leave it, 5 mm. With .85
 hidden backs had .56 of real hands' contrast at 4-8 px, with this .60 (17 photos of same_hand, when all relief added 1.4
 times as much as now)."""
-MOST, DEEPEST_ON_PALM = 0.7, 0.35
-"""Heights above and below the skin around to which forms are clamped, and the depth on palms, whose creases are lines
-of the maps besides [mm]."""
+MOST, DEEPEST = 0.7, 0.35
+"""Height above and depth below the skin around to which forms are clamped [mm]: creases of palms are lines of the maps
+besides, and deeper hollows between knuckles looked like bruises."""
 BONY, TENDONS = (0.3, 0.9), (0.05, 0.45)
 """Range of how bony people are and how their tendons show; those of the synthetic world have .1 to .9 and .2 to 1."""
 
@@ -165,8 +171,7 @@ def relief(hand: HandModel, seed: int) -> Float[Tensor, "V"]:
     bony, tendons = torch.rand(2, generator=torch.Generator().manual_seed(seed + 2)).tolist()
     bony, tendons = (low + share * (high - low) for share, (low, high) in ((bony, BONY), (tendons, TENDONS)))
     heights = forms.new_tensor([1, bony, tendons, bony * tendons]) @ forms
-    deepest = torch.lerp(torch.tensor(-MOST), torch.tensor(-DEEPEST_ON_PALM), label_regions(hand).palm.cpu())
-    return torch.maximum(heights, deepest).clamp_max(MOST)
+    return heights.clamp(-DEEPEST, MOST)
 
 
 def relief_shade(hand: HandModel, seed: int) -> Float[Tensor, "V 3"]:

@@ -57,8 +57,8 @@ ON_PALM, ON_BACK = 2.0, 1.25
 """Gain of the maps' detail on palms and on backs."""
 LOUDEST_ON_PALM, LOUDEST_ON_BACK = 0.2, 0.12
 """Logarithms of sRGB that this detail tends to. The maps have the same contrast all over palms, not over backs."""
-LINES_ON_PALM = 1.8
-"""Gain of the drawn lines of palms."""
+LINES_ON_PALM, LINES_ON_BACK = 1.8, 2.6
+"""Gain of the drawn lines."""
 FOLD, VEIN = (-0.10, -0.14, -0.15), (-0.07, -0.04, -0.04)
 """What a fold and a vein add to the logarithms of the colours."""
 USUAL_CONTRASTS = 0.023, 0.016
@@ -318,7 +318,7 @@ def _grain(gaussians: CanonicalGaussians, seed: int) -> Float[Tensor, "N 1"]:
 
 def _skin_detail(detail: SkinDetail, palm: Float[Tensor, "N 1"] | float) -> Float[Tensor, "N 3"]:
     """What is added to the logarithms of smooth skin's colours; `palm` is its share."""
-    folds = (1 + (LINES_ON_PALM - 1) * palm) * detail.fold[:, None]
+    folds = (LINES_ON_BACK + (LINES_ON_PALM - LINES_ON_BACK) * palm) * detail.fold[:, None]
     lines = folds * detail.skin.new_tensor(FOLD) + detail.vein[:, None] * detail.skin.new_tensor(VEIN)
     own = (ON_BACK + (ON_PALM - ON_BACK) * palm) * detail.skin
     loudest = LOUDEST_ON_BACK + (LOUDEST_ON_PALM - LOUDEST_ON_BACK) * palm

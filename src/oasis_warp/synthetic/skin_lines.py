@@ -130,7 +130,7 @@ def draw_fingers(atlas: Atlas, strokes: Strokes, identity: Identity) -> None:
                 _folds(atlas, strokes, identity, name, place, bone)
 
 
-def _arc(atlas: Atlas, name: str, bone: Bone, t: float, angles: np.ndarray, radius: float, bow: float) -> np.ndarray:
+def arc(atlas: Atlas, name: str, bone: Bone, t: float, angles: np.ndarray, radius: float, bow: float) -> np.ndarray:
     """Surface points around a bone at `t` [mm]; angle 0 is the back, `bow` bends the arc along the bone."""
     around = np.cos(angles)[:, None] * bone.back + np.sin(angles)[:, None] * bone.side
     middle = angles - angles.mean()
@@ -143,18 +143,18 @@ def _creases(atlas: Atlas, strokes: Strokes, identity: Identity, name: str, plac
     if place == 0 and not thumb:
         for t in (bone.length * 0.52, bone.length * 0.52 + 2.5)[: 1 + (rng.random() < 0.7)]:
             angles = np.pi + np.linspace(-1.6, 1.6, 30)
-            strokes.add("crease", _arc(atlas, name, bone, t + rng.normal(0, 0.7), angles, 10.0, rng.normal(0, 0.15)),
+            strokes.add("crease", arc(atlas, name, bone, t + rng.normal(0, 0.7), angles, 10.0, rng.normal(0, 0.15)),
                         u(0.45, 0.65), u(0.5, 0.95), taper=0.3)  # fmt: skip
         return
     places = _THUMB_CREASES[place] if thumb else _CREASES[place]
     for t in places[: len(places) - (rng.random() < 0.15 and len(places) > 1)]:
         span = u(1.5, 2.0)
         angles = np.pi + rng.normal(0, 0.08) + np.linspace(-span, span, 30) * u(0.85, 1)
-        line = _arc(atlas, name, bone, t + rng.normal(0, 0.5), angles, 9.0, rng.normal(0, 0.15))
+        line = arc(atlas, name, bone, t + rng.normal(0, 0.5), angles, 9.0, rng.normal(0, 0.15))
         strokes.add("crease", line, u(0.4, 0.62), u(0.7, 1.15) * (0.8 if place == 2 else 1), taper=0.3)
     for _ in range(rng.integers(2, 6) + int(5 * identity.line_wealth)):
         middle, half = np.pi + rng.normal(0, 0.7), u(0.25, 0.7)
-        line = _arc(atlas, name, bone, rng.normal(0, 3.2), np.linspace(middle - half, middle + half, 14), 9.0,
+        line = arc(atlas, name, bone, rng.normal(0, 3.2), np.linspace(middle - half, middle + half, 14), 9.0,
                     rng.normal(0, 0.3))  # fmt: skip
         strokes.add("crease", line, u(0.28, 0.42), u(0.15, 0.45), taper=0.5)
     for _ in range(int(rng.integers(2, 5) + 6 * identity.line_wealth)):  # lengthwise lines of the pads
@@ -175,12 +175,12 @@ def _folds(atlas: Atlas, strokes: Strokes, identity: Identity, name: str, place:
     for t in np.linspace(-1, 1, count):
         half, middle = u(0.4, 0.8) * (1.2 - 0.1 * abs(t)), rng.normal(0, 0.14)
         angles = np.linspace(middle - half, middle + half, 16)
-        line = _arc(atlas, name, bone, t * reach + rng.normal(0, 0.4) - (place == 1), angles, 8.0,
+        line = arc(atlas, name, bone, t * reach + rng.normal(0, 0.4) - (place == 1), angles, 8.0,
                     -0.9 * np.sign(t) * abs(t) + rng.normal(0, 0.3))  # fmt: skip
         strokes.add("fold", line, u(0.45, 0.75), u(0.7, 1.6) * depth, taper=0.4, wobble=0.4)
     for _ in range(int(3 + 8 * identity.age)):
         middle, half = rng.normal(0, 0.4), u(0.15, 0.4)
-        line = _arc(
+        line = arc(
             atlas, name, bone, rng.normal(0, reach * 0.8), np.linspace(middle - half, middle + half, 10), 8.0, 0.0
         )
         strokes.add("fold", line, u(0.35, 0.5), u(0.3, 0.8) * depth, taper=0.5, wobble=0.5)
