@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from oasis_warp.core.hand_model import KNUCKLES
+from oasis_warp.estimation.finger_contact import FingerContact
 from oasis_warp.estimation.fit_problem import FitState, FitTarget, Linearized
 from oasis_warp.estimation.gesture_prior import gesture_prior
 from oasis_warp.estimation.landmarks import BONES
@@ -127,6 +128,7 @@ class Fitter:
         finger_flexion = (axis == 0) & (joint < 13)
         self.relaxed = np.where(finger_flexion, np.array(s.relaxed)[(joint - 1) % 3], 0.0)
         self.gestures = gesture_prior(kinematics, s.gesture)
+        self.contact = FingerContact(kinematics)
         self.low, self.high = kinematics.limits[joint, axis].T
         n_shape = kinematics.shape_basis.shape[2]
         if shape is None:
@@ -176,6 +178,11 @@ class Fitter:
             residuals.append(error * weight)
             jacobians.append(np.einsum("na,nak->nk", pairs.normal * (weight / (s.outline * box))[:, None], rim.d_image))
             cost += float((loss * share).sum())
+        if surface is not None:
+            contact = self.contact.term(joints, -state.rotation.T @ state.translation())
+            residuals.append(contact.residual)
+            jacobians.append(np.pad(contact.jacobian, ((0, 0), (6, 1))))
+            cost += contact.cost
         if surface is not None and len(surface.vertex):
             for residual, jacobian, loss in self._surface_terms(state, joints, surface):
                 residuals.append(residual.ravel())
