@@ -49,12 +49,12 @@ def test_the_gradient_is_that_of_the_cost(hand, kinematics, contact):
     angles, shape = 0.95 * free_angles(hand, kinematics, "fist"), np.random.default_rng(0).normal(0, 0.5, 40)
     term = contact.term(posed(kinematics, angles, shape), BEFORE_PALM)
     gradient, step = 2 * term.jacobian.T @ term.residual, 1e-7
-    for k in range(len(angles) + 10):
-        costs = []
-        for sign in (-1, 1):
-            change = np.zeros(len(gradient))
-            change[k] = sign * step
-            joints = posed(kinematics, angles + change[: len(angles)], shape + change[len(angles) :])
-            costs.append(contact.term(joints, BEFORE_PALM).cost)
-        assert (costs[1] - costs[0]) / (2 * step) == pytest.approx(gradient[k], rel=0.1, abs=1.0)
-    assert np.abs(gradient).max() > 50
+
+    def cost(k, by):
+        change = np.zeros(len(gradient))
+        change[k] = by
+        joints = posed(kinematics, angles + change[: len(angles)], shape + change[len(angles) :])
+        return contact.term(joints, BEFORE_PALM).cost
+
+    numeric = np.array([(cost(k, step) - cost(k, -step)) / (2 * step) for k in range(len(gradient))])
+    assert np.linalg.norm(numeric - gradient) < 0.05 * np.linalg.norm(numeric)
