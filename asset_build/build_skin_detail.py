@@ -76,8 +76,9 @@ GREY, STEPS = 128, 400
 PEOPLE, LOUDEST_LINE = (4, 9), 2.0
 """People of the synthetic world whose palm's lines are taken, and the first one's veins; the strength of a line that is
 stored as 255. The photos' own lines are blurred."""
-FOLDS = {1: (6, 6.5, 1.6), 2: (3, 2.2, 1.3)}
-"""Number of folds over a finger's middle and end joint, how far from it they lie [mm], and their greatest strength."""
+FOLDS, FOLDS_OF_THUMB = {1: (6, 6.5, 1.6), 2: (3, 2.2, 1.3)}, {2: (5, 4.5, 0.9)}
+"""Number of folds over a finger's middle and end joint, how far from it they lie [mm], and their greatest strength. The
+thumb's middle joint has none: they looked like a scab there."""
 FOLD_ANGLE, FOLD_BOW = 0.95, -1.6
 """Half of what the longest fold covers around the finger [rad], and how far the ends of the outermost ones bend back
 towards the joint [mm/rad^2]."""
@@ -271,7 +272,7 @@ def knuckle_folds(seed: int) -> torch.Tensor:
     atlas, strokes = bundled_atlas(), Strokes(np.random.default_rng([seed]))
     u = strokes.rng.uniform
     for finger, name in enumerate(FINGERS):
-        for place, (count, reach, strength) in FOLDS.items():
+        for place, (count, reach, strength) in (FOLDS_OF_THUMB if name == "thumb" else FOLDS).items():
             bone = bundled_body().bones[finger][place]
             for t in np.linspace(-1, 1, count):
                 half = FOLD_ANGLE * np.sqrt(1.15 - t**2) * u(0.75, 1.1)

@@ -35,8 +35,8 @@ CAP_RINGS = 20
 """Steps of the cap's rings from the rim to its middle: 1.5 mm, closer than the skin's vertices."""
 MIRRORED = 0.05
 """The stretch of skin before the rim whose detail the end of the wrist repeats in the mirror [m]."""
-AVERAGED = 200
-"""Number of nearest Gaussians of that skin, 8 mm around; detail is the difference of one from their mean. With 32 the
+AVERAGED = 100
+"""Number of nearest Gaussians of that skin, 6 mm around; detail is the difference of one from their mean. With 32 the
 blotches of a back ended at the rim."""
 DARKEST = 0.02
 """Colours are clamped to it before their logarithm is taken [sRGB]."""
@@ -89,6 +89,8 @@ def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tens
     index, offsets, end_quats, end_scales = (torch.cat(parts) for parts in zip(*end, strict=True))
     scales = full.scales[0]
     points = torch.cat([rest[vertices], rest[index] + offsets])
+    left = vertex_to_gaussians(shade_left(hand, rest), faces, kept)
+    kept = kept._replace(colors=_calmed(kept, rest, faces, left))
     read = _continued(gaussians, own, rest, faces, rim, torch.cat([points, rest[faces[on_faces]].mean(1)]))
     read = read.split([len(points), len(on_faces)])
 
@@ -100,7 +102,7 @@ def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tens
 
     shade = kept.shade
     if shade is not None:
-        shade = shade ** vertex_to_gaussians(shade_left(hand, rest), faces, kept)
+        shade = shade**left
     return CanonicalGaussians(
         torch.cat([kept.vertex_index, vertices, index]),
         torch.cat([kept.offsets, torch.zeros_like(rest[vertices]), offsets]),
@@ -124,6 +126,28 @@ def shade_left(hand: HandModel, rest: Tensor) -> Float[Tensor, "V 1"]:
     return rim_fade(rest[None], hand.rim.to(rest.device), RIM_FADE, SHADE_FADE)[0, :, None]
 
 
+def _centers(gaussians: CanonicalGaussians, rest: Tensor, faces: Tensor) -> Float[Tensor, "N 3"]:
+    on_faces = (rest[faces[gaussians.face_index]] * gaussians.barycentrics[..., None]).sum(1)
+    return torch.cat([rest[gaussians.vertex_index] + gaussians.offsets, on_faces])
+
+
+def _average(logs: Float[Tensor, "N 3"], places: Tensor, at: Float[Tensor, "M 3"]) -> tuple[Tensor, Tensor]:
+    """Mean of the skin's logarithms around each point, and the share of its detail that has no more than `CONTRAST`."""
+    around = logs[_nearest(at, places, AVERAGED)]
+    average = around.mean(1)
+    contrast = (around - average[:, None]).square().mean((1, 2)).sqrt()
+    return average, (CONTRAST / contrast.clamp_min(CONTRAST))[:, None]
+
+
+def _calmed(gaussians: CanonicalGaussians, rest: Tensor, faces: Tensor, left: Float[Tensor, "N 1"]) -> Tensor:
+    """Colours whose detail before the end is as quiet as that of the arm; `left` is 1 where they stay."""
+    near = torch.nonzero(left[:, 0] < 1)[:, 0]
+    logs, centers = gaussians.colors[near].clamp_min(DARKEST).log(), _centers(gaussians, rest, faces)[near]
+    average, quiet = _average(logs, centers, centers)
+    calm = average + torch.lerp(quiet, torch.ones_like(quiet), left[near]) * (logs - average)
+    return gaussians.colors.index_copy(0, near, calm.exp().clamp(max=1))
+
+
 def _continued(
     gaussians: CanonicalGaussians, fade: Tensor, rest: Tensor, faces: Tensor, rim: Tensor, points: Tensor
 ) -> Float[Tensor, "M 3"]:
@@ -133,8 +157,7 @@ def _continued(
     of one colour each. Detail is the difference of the skin as far before that place, in the same direction from the
     wrist's axis, from its own averages; towards the middle of the cap, where all directions meet, it ends.
     """
-    on_faces = (rest[faces[gaussians.face_index]] * gaussians.barycentrics[..., None]).sum(1)
-    centers = torch.cat([rest[gaussians.vertex_index] + gaussians.offsets, on_faces])
+    centers = _centers(gaussians, rest, faces)
     far = torch.cdist(centers, rest[rim]).amin(1)
     skin = (fade >= 1) & (far < MIRRORED)
     start = skin & (far < 2 * RIM_FADE)
@@ -158,11 +181,9 @@ def _continued(
     keys = torch.cat([aside, past[:, None]], 1), torch.cat([skin_aside, before[:, None]], 1)
     source = _nearest(*keys, 1)[:, 0]
     logs, places = gaussians.colors[skin].clamp_min(DARKEST).log(), centers[skin]
-    around = logs[_nearest(places[source], places, AVERAGED)]
-    average = around.mean(1)
-    contrast = (around - average[:, None]).square().mean((1, 2)).sqrt()
-    weight = (CONTRAST / contrast.clamp_min(CONTRAST)) * (2 * out / radius).clamp(max=1)
-    detail = (logs[source] - average).clamp(-3 * CONTRAST, 3 * CONTRAST) * weight[:, None]
+    average, quiet = _average(logs, places, places[source])
+    quiet = quiet * (2 * out / radius).clamp(max=1)[:, None]
+    detail = (logs[source] - average).clamp(-3 * CONTRAST, 3 * CONTRAST) * quiet
     return (mean * detail.exp()).clamp(max=1)
 
 
