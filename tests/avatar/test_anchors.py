@@ -18,7 +18,7 @@ from oasis_warp.avatar.appearance import (
 )
 from oasis_warp.avatar.densify import densify
 from oasis_warp.avatar.pose import pose_gaussians, with_photo
-from oasis_warp.avatar.wrist import ARM_LENGTH, close_wrist, end_shade, fading_arm, rim_axis
+from oasis_warp.avatar.wrist import ARM_LENGTH, SHADE_FADE, close_wrist, end_shade, fading_arm, rim_axis
 from oasis_warp.core import rotation, surface
 from oasis_warp.core.camera import orbit_camera, project
 from oasis_warp.core.mirror import mirror_canonical, mirror_points
@@ -215,13 +215,18 @@ def test_the_detail_of_the_end_is_no_louder_than_skin(hand, hands):
     on_end = (torch.cdist(centers(hand, rest, after), rest[hand.rim]).amin(1) < 0.3 * RIM_FADE).nonzero()[:, 0]
     logs = after.colors[on_end[on_end >= len(after.vertex_index)]].log()
     assert 0.01 < (logs - logs.mean(0)).std() < 0.04
+    far = torch.cdist(centers(hand, rest, after), rest[hand.rim]).amin(1)
+    before_end = ((far > RIM_FADE) & (far < RIM_FADE + 0.2 * SHADE_FADE)).nonzero()[:, 0]
+    logs = after.colors[before_end].log()
+    assert (logs - logs.mean(0)).std() < 0.12  # it was .3, and ended at the rim in specks
 
 
 def test_the_hand_beyond_the_fade_keeps_its_bits_and_the_cap_goes_with_the_wrist(hand, hands):
     rest, before, after = hands
     cap = torch.zeros(len(after.opacities), dtype=torch.bool)
     cap[: len(after.vertex_index)] = after.offsets.norm(dim=1) > 2e-3
-    beyond = [torch.cdist(centers(hand, rest, g), rest[hand.rim]).amin(1) > 2 * RIM_FADE for g in hands[1:]]
+    changed = RIM_FADE + SHADE_FADE + 0.004  # a face wide
+    beyond = [torch.cdist(centers(hand, rest, g), rest[hand.rim]).amin(1) > changed for g in hands[1:]]
     for name in ("quats", "scales", "opacities", "colors"):
         assert torch.equal(getattr(before, name)[beyond[0]], getattr(after, name)[beyond[1] & ~cap])
     fist = HandPose(named_pose(hand, "fist"), torch.eye(3), torch.zeros(3))
