@@ -90,7 +90,7 @@ def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tens
     scales = full.scales[0]
     points = torch.cat([rest[vertices], rest[index] + offsets])
     left = vertex_to_gaussians(shade_left(hand, rest), faces, kept)
-    kept = kept._replace(colors=_calmed(kept, rest, faces, left))
+    kept = kept._replace(colors=_calmed(kept, rest, faces, (2 * left).clamp(max=1)))
     read = _continued(gaussians, own, rest, faces, rim, torch.cat([points, rest[faces[on_faces]].mean(1)]))
     read = read.split([len(points), len(on_faces)])
 
