@@ -208,7 +208,7 @@ def sharpened(detail: np.ndarray, on: np.ndarray) -> np.ndarray:
 
 
 def even_palm(hand: HandModel, detail: np.ndarray, faces: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Only what is fine in the detail of palms, with the same contrast everywhere.
+    """Only what is fine in the detail of palms, with the same contrast everywhere; on backs less of what is wide.
 
     In the pictures, creases are dark bars, the widest of pigment on dark skin, and the paint that fills the sides of
     fingers frames them: on straightened fingers, rings and frames as of nails. Divided by its contrast around,

@@ -23,8 +23,8 @@ SIGMA, SCALE = 0.004, 2.5
 """Standard deviation of a gap [m], and the robust scale in sigmas (Cauchy)."""
 REACH, INSIDE = 0.018, 0.006
 """Gap from which nothing is drawn, and how deep inside a finger the thumb may lie to be before it [m]. With 30 mm the
-ring of thumb and index of one photo was closed. All of these were set on 24 photos of tests/data/photos/same_hand, and
-compared on 120 synthetic photos of a world of their own."""
+ring of thumb and index of one photo was closed. All of these were set by eye on 22 photos of
+tests/data/photos/same_hand and five beside them, and compared on 120 synthetic photos of a world of their own."""
 WEIGHT = 3.0
 """Number of observations that a contact counts as."""
 ENDS, THUMB = (3, 6, 9, 12), 15
