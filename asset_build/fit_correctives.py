@@ -4,14 +4,15 @@
     python asset_build/simulate_flesh.py out/flesh
     python asset_build/fit_correctives.py out/flesh --hand out/hand.npz --out src/oasis_warp/assets/hand/hand_right.npz
 
-The file given may hold correctives already: they are left out of account and replaced. It prints the digest that
-`src/oasis_warp/assets/hand/SHA256` has to hold, and how far skinning with and without the correctives is from the flesh
-in poses that they were not fitted to.
+The file given may hold correctives already: they are left out of account and replaced. Knuckles, which the flesh does
+not have, are added to what is fitted. It prints the digest that `src/oasis_warp/assets/hand/SHA256` has to hold, and how
+far skinning with and without the fitted correctives is from the flesh in poses that they were not fitted to.
 """
 
 import argparse
 from pathlib import Path
 
+import igl
 import numpy as np
 import scipy.sparse as sp
 import torch
@@ -19,6 +20,7 @@ from elastic_hand import simulations
 from elastic_hand.correctives import fit_to_flesh, strengths
 from elastic_hand.solid import MILLIMETRES, skinned
 from hand_build.anatomy import Array
+from hand_build.knuckles import knuckle_shapes
 from hand_build.source import write_npz
 
 from oasis_warp.core.hand_model import HandModel
@@ -58,8 +60,10 @@ def main() -> None:
     made = simulations.load(args.flesh)
     learnt, judged = ([m for m in made if m.part == part] for part in (simulations.TRAIN, simulations.HELD_OUT))
     shapes = fit_to_flesh(hand, subdivision, learnt, simulations.gestures(hand, N_GESTURES, SEED))
+    rest, faces = arrays["v_template"][:n_base].astype(float) * MILLIMETRES, arrays["faces"].astype(np.int64)
+    raised = shapes + knuckle_shapes(hand, rest, np.asarray(igl.per_vertex_normals(rest, faces)))
     correctives = np.zeros((n_base + 1, 3, len(shapes)), np.float16)  # the last vertex only closes the wrist
-    correctives[:n_base] = shapes.transpose(1, 2, 0) / MILLIMETRES
+    correctives[:n_base] = raised.transpose(1, 2, 0) / MILLIMETRES
     digest = write_npz(args.out, {**arrays, "correctives": correctives})
     print(f"{digest}  {args.out.name}")
     fine = np.stack([subdivision @ shape for shape in shapes])

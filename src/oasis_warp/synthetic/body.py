@@ -36,7 +36,8 @@ ATLAS_ARM_BIAS = 0.7
 SKIN, SLEEVE, BAND, RING = range(4)
 """Materials of faces."""
 KNUCKLE_RISE = (2.0, 1.7, 0.8)
-"""How far each knuckle of a finger stands out when bent by 90 degrees, from the palm outwards [mm]."""
+"""How far each knuckle of a finger stands out farther on the boniest hands than on others when bent by 90 degrees, from
+the palm outwards [mm]."""
 
 
 @dataclass(frozen=True)
@@ -68,19 +69,29 @@ def _bone(hand: HandModel, finger: int, place: int) -> Bone:
     return Bone(start, along, back, np.cross(back, along), length)
 
 
-def _knuckle_rise(points: np.ndarray, normals: np.ndarray, bones: tuple[tuple[Bone, ...], ...]) -> Tensor:
-    """Displacements that keep bent knuckles pointed, which blend skinning rounds off: [V, 15] in metres, of [mm]."""
+def finger_bones(hand: HandModel) -> tuple[tuple[Bone, ...], ...]:
+    """Three of each of `FINGERS`."""
+    return tuple(tuple(_bone(hand, finger, place) for place in range(3)) for finger in range(len(FINGERS)))
+
+
+def rising(values: np.ndarray, start: float, end: float) -> np.ndarray:
+    """Smoothly from 0 at `start` to 1 at `end`."""
+    t = np.clip((values - start) / (end - start), 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def knuckle_rise(points: np.ndarray, normals: np.ndarray, bones: tuple[tuple[Bone, ...], ...]) -> np.ndarray:
+    """How far each knuckle bent by 90 degrees pushes points of the surface out along their normals [mm], [V, 15]."""
     out = np.zeros((len(points), 15))
     for finger, of_finger in enumerate(bones):
         for place, bone in enumerate(of_finger):
             if FINGERS[finger] == "thumb" and place == 0:  # lies deep in the hand
                 continue
             along, side, back = bone.local(points).T
-            t = np.clip((normals @ bone.back - 0.15) / 0.65, 0, 1)
             width, length = (7.5, 7.0) if place == 0 else (6.0, 5.0)
             shape = np.exp(-((side / width) ** 2) - ((along - 0.5) / length) ** 2) * (np.abs(side) < 14) * (back > 0)
-            out[:, 3 * finger + place] = KNUCKLE_RISE[place] * t * t * (3 - 2 * t) * shape
-    return torch.from_numpy(out * 1e-3).float()
+            out[:, 3 * finger + place] = KNUCKLE_RISE[place] * rising(normals @ bone.back, 0.15, 0.8) * shape
+    return out
 
 
 def _tube_faces(rows: np.ndarray) -> np.ndarray:
@@ -227,7 +238,8 @@ def bundled_body() -> Body:
     toward = torch.cat([0.5 - 0.5 * torch.cos(hand.bone_theta), 0.5 - 0.5 * normals[n:, 1]])
     palm = surface.smooth_over_mesh(toward[:, None], edges, 5)[:, 0]
     weights = torch.cat([hand.weights, torch.eye(16)[:1].expand(len(rest) - n, 16)])
-    bones = tuple(tuple(_bone(hand, finger, place) for place in range(3)) for finger in range(5))
+    bones = finger_bones(hand)
+    rise = knuckle_rise(rest[:n].double().numpy() * 1e3, normals[:n].double().numpy(), bones)
     by_finger = torch.stack([weights[:, 3 * k + 1 : 3 * k + 4].sum(1) for k in range(5)], 1)
     with asset("synthetic", "coarse_body.npz").open("rb") as file, np.load(file, allow_pickle=False) as stored:
         coarse_vertices, coarse_faces = (torch.from_numpy(stored[k].astype(np.int64)) for k in ("vertices", "faces"))
@@ -247,7 +259,7 @@ def bundled_body() -> Body:
         palm=palm,
         finger_weights=by_finger,
         bones=bones,
-        knuckle_rise=_knuckle_rise(rest[:n].double().numpy() * 1e3, normals[:n].double().numpy(), bones),
+        knuckle_rise=torch.from_numpy(rise * 1e-3).float(),
     )
 
 

@@ -304,7 +304,7 @@ def _columns(shots: Sequence[Shot], identities: Sequence[Identity], joints: np.n
     rotations, translations = bundled_skeleton().transforms(angles, joints)
     flexion = angles[:, 1:, 0] + bundled_hand().rest_bend[1:].numpy()
     bent = (1 - np.cos(np.maximum(flexion, 0))).astype(np.float32)
-    bony = np.array([0.4 + 0.9 * i.bony for i in identities], np.float32)
+    bony = np.array([0.9 * (i.bony - 0.5) for i in identities], np.float32)  # beside the hand's own correctives
     each, finger_root = np.arange(len(shots)), [3 * max(i.ring_finger, 0) + 1 for i in identities]
     clothes, views, lights = ([getattr(s, name) for s in shots] for name in ("clothes", "view", "light"))
     columns: dict[str, Any] = {
