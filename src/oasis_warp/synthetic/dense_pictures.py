@@ -24,6 +24,9 @@ GLOSSY, DIM = 0.3, 0.3
 """Shares of moved photos whose skin shines, and that are darker and greyer."""
 GLOSS, GLOSS_POWERS = (0.03, 0.4), (3.0, 30.0)
 """Ranges of the gloss, in linear light, and of the exponent of its lobe."""
+ALIKE, ALIKE_GAIN = 0.3, 0.4
+"""Share of moved photos in which one side of the hand has the tone of what is around it, and the standard deviation of
+the logarithm by which that side is brighter or darker than it was."""
 DIM_POWER, DIM_GREY = 0.8, 0.6
 """Largest rise of the logarithm of a dim photo's exponent, and share of its saturation that goes."""
 MIN_SKIN = 0.6
@@ -112,30 +115,46 @@ def _with_ground_truth(batch: ShadedBatch, image: Tensor, front: Tensor) -> Dens
     )
 
 
-def _shining(batch: DenseBatch, random: torch.Generator) -> Float[Tensor, "B 3 H W"]:
-    """The photos, some of them with one broad highlight on the skin, as dark skin has beside a window."""
+def _disguised(batch: DenseBatch, random: torch.Generator) -> Float[Tensor, "B 3 H W"]:
+    """The photos; in some, one side of the hand has the tone of its surroundings; some have a broad highlight.
+
+    The back of a dark hand beside a window is grey and shines; before stone nothing but its form tells it from that.
+    """
     count, device = len(batch.image), batch.image.device
 
     def between(low: float, high: float) -> Tensor:
         return low + (high - low) * torch.rand(count, 1, 1, 1, generator=random, device=device)
 
-    toward = torch.randn(count, 3, 1, 1, generator=random, device=device)
-    toward = torch.nn.functional.normalize(torch.cat([toward[:, :2], -toward[:, 2:].abs()], 1), dim=1)
+    def normal(channels: int) -> Tensor:
+        return torch.randn(count, channels, 1, 1, generator=random, device=device)
+
+    def facing() -> Tensor:
+        """Cosine between the skin and a direction, within 90 degrees of the camera's."""
+        toward = normal(3)
+        toward = torch.nn.functional.normalize(torch.cat([toward[:, :2], -toward[:, 2:].abs()], 1), dim=1)
+        return (facets * toward).sum(1, keepdim=True).clamp_min(0)
+
     skin = batch.skin[:, None].float()  # its outermost pixels have no normals
     near = avg_pool2d(torch.cat([batch.normal * skin, skin], 1), 5, 1, 2)
-    normal = torch.nn.functional.normalize(near[:, :3], dim=1)
-    lobe = (normal * toward).sum(1, keepdim=True).clamp_min(0) ** between(*map(math.log, GLOSS_POWERS)).exp()
-    strength = between(*map(math.log, GLOSS)).exp() * (between(0.0, 1.0) < GLOSSY)
-    tint = 1 + 0.1 * torch.randn(count, 3, 1, 1, generator=random, device=device)
+    facets = torch.nn.functional.normalize(near[:, :3], dim=1)
     share = batch.classes[:, 1:2] * (near[:, 3:] > 0)
-    gloss = share * strength * tint.clamp_min(0) * lobe
-    return srgb((linear_light(batch.image.movedim(1, -1)).movedim(-1, 1) + gloss).clamp(0, 1))
+    light = linear_light(batch.image.movedim(1, -1)).movedim(-1, 1)
+    around = batch.classes[:, :1]
+    tone = (light * around).sum((2, 3), keepdim=True) / around.sum((2, 3), keepdim=True).clamp_min(1)
+    grey = light.mean(1, keepdim=True)
+    alike = grey * tone / tone.mean(1, keepdim=True).clamp_min(1e-3) * (ALIKE_GAIN * normal(1)).exp()
+    side = share * (4 * facing() - between(0.5, 2.5)).clamp(0, 1) * (between(0.0, 1.0) < ALIKE) * between(0.4, 1.0)
+    light = torch.lerp(light, alike, side)
+    lobe = facing() ** between(*map(math.log, GLOSS_POWERS)).exp()
+    strength = between(*map(math.log, GLOSS)).exp() * (between(0.0, 1.0) < GLOSSY)
+    return srgb((light + share * strength * (1 + 0.1 * normal(3)).clamp_min(0) * lobe).clamp(0, 1))
 
 
 def moved(batch: DenseBatch, random: torch.Generator) -> DenseBatch:
     """The same photos rotated, scaled, shifted, and in other colours; what comes in is black or of one colour.
 
-    A photo takes long to render, so training shows each one again like this. Some of them shine, and some are dim.
+    A photo takes long to render, so training shows each one again like this. Some of them shine, some are dim, and in
+    some a side of the hand looks like what is around it.
     """
     count, size = len(batch.image), batch.image.shape[-1]
 
@@ -145,7 +164,7 @@ def moved(batch: DenseBatch, random: torch.Generator) -> DenseBatch:
     def uniform(*shape: int, low: float, high: float) -> Tensor:
         return low + (high - low) * torch.rand(*shape, generator=random, device=random.device)
 
-    angle = uniform(count, low=-0.9, high=0.9)
+    angle = uniform(count, low=-math.pi, high=math.pi)
     scale, shift = uniform(count, low=-0.35, high=0.3).exp(), normal(count, 2, sigma=0.18)
     cos, sin = angle.cos(), angle.sin()
     rotation = torch.stack([cos, -sin, sin, cos], 1).view(-1, 2, 2)
@@ -157,7 +176,7 @@ def moved(batch: DenseBatch, random: torch.Generator) -> DenseBatch:
 
     border = uniform(count, 3, 1, 1, low=0.0, high=1.0) * (uniform(count, 1, 1, 1, low=-1.0, high=1.0) > 0)
     power, gain = normal(count, 1, 1, 1, sigma=0.2).exp(), normal(count, 3, 1, 1, sigma=0.12).exp()
-    image = ((sample(_shining(batch, random) - border) + border).clamp(0, 1) ** power * gain).clamp(0, 1)
+    image = ((sample(_disguised(batch, random) - border) + border).clamp(0, 1) ** power * gain).clamp(0, 1)
     dim = (uniform(count, 1, 1, 1, low=0.0, high=1.0) < DIM) * uniform(2, count, 1, 1, 1, low=0.0, high=1.0)
     image = torch.lerp(image, image.mean(1, keepdim=True), DIM_GREY * dim[0]) ** (DIM_POWER * dim[1]).exp()
     classes, albedo, inside = sample(
