@@ -5,8 +5,8 @@
     python asset_build/fit_correctives.py out/flesh --hand out/hand.npz --out src/oasis_warp/assets/hand/hand_right.npz
 
 The file given may hold correctives already: they are left out of account and replaced. Knuckles, which the flesh does
-not have, are added to what is fitted. It prints the digest that `src/oasis_warp/assets/hand/SHA256` has to hold, and how
-far skinning with and without the fitted correctives is from the flesh in poses that they were not fitted to.
+not have, are added to what is fitted. It prints the digest that `src/oasis_warp/assets/hand/SHA256` has to hold, and
+how far skinning with and without the fitted correctives is from the flesh in poses that they were not fitted to.
 """
 
 import argparse

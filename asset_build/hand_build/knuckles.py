@@ -3,6 +3,8 @@
 Heights and depths were set by eye on the mesh of a fist seen from its back, by no photo of the tests.
 """
 
+import itertools
+
 import numpy as np
 
 from hand_build.anatomy import Array
@@ -25,7 +27,7 @@ def knuckle_shapes(hand: HandModel, vertices: Array, normals: Array) -> Array:
     """
     bones = finger_bones(hand)
     height = knuckle_rise(vertices, normals, bones) * np.tile(HIGHER, len(FINGERS))
-    for finger, other in zip(ROW, ROW[1:], strict=False):
+    for finger, other in itertools.pairwise(ROW):
         joints = [3 * FINGERS.index(name) for name in (finger, other)]
         first, second = (bones[FINGERS.index(name)][0] for name in (finger, other))
         middle = (first.origin + second.origin) / 2

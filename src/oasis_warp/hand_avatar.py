@@ -14,8 +14,9 @@ from oasis_warp.avatar.pose import (
     mirror_surface_light,
     pose_gaussians,
     with_photo,
-    with_self_occlusion,
+    with_todays_light,
 )
+from oasis_warp.avatar.sky import NOTHING_HIDDEN
 from oasis_warp.core.camera import camera_center
 from oasis_warp.core.color import plain_background
 from oasis_warp.core.config import BLACK, WHITE
@@ -41,7 +42,7 @@ from oasis_warp.core.types import (
     Render,
     Side,
 )
-from oasis_warp.data.avatar_file import LIGHT_SCATTERED, load_avatar, save_avatar
+from oasis_warp.data.avatar_file import DARK_HOLLOWS, load_avatar, save_avatar
 from oasis_warp.hand.contact import resolve_contact
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin, skin_surface
@@ -362,15 +363,16 @@ class Avatar:
             invented=tensors.get("invented"),
             hand=hand,
         )
-        return avatar._with_todays_light() if header["version"] < LIGHT_SCATTERED else avatar
+        return avatar._with_todays_light(header["version"]) if header["version"] < DARK_HOLLOWS else avatar
 
     @torch.no_grad()
-    def _with_todays_light(self) -> "Avatar":
-        """An avatar of an older file version, whose light followed other rules. The photo's own view stays."""
-        if self.light is None:
+    def _with_todays_light(self, version: int) -> "Avatar":
+        """An avatar of a file of an older version, whose light followed other rules. The photo's own view stays."""
+        if self.light is None or (self.light.albedo is None and version > NOTHING_HIDDEN):
             return self
         albedo = self._mean_albedo(self.light.even) if self.light.albedo is None else self.light.albedo
-        light = with_self_occlusion(self.light, albedo, self.rest.vertices, self._photo_surface(), self.hand.faces)
+        surface = self._photo_surface()
+        light = with_todays_light(version, self.light, albedo, self.rest.vertices, surface, self.hand.faces)
         return self.with_looks(self.gaussians, light)
 
 

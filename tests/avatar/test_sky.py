@@ -1,3 +1,4 @@
+import functools
 import math
 
 import pytest
@@ -15,7 +16,15 @@ from oasis_warp.avatar.pose import (
     split_shade,
     with_photo_colors,
 )
-from oasis_warp.avatar.sky import bounced, environment_light, harmonic_basis, radiance, sky_mesh, studio_light
+from oasis_warp.avatar.sky import (
+    arriving_before,
+    bounced,
+    environment_light,
+    harmonic_basis,
+    radiance,
+    sky_mesh,
+    studio_light,
+)
 from oasis_warp.core import rotation
 from oasis_warp.core.camera import camera_center
 from oasis_warp.core.mirror import mirror_light, mirror_points
@@ -64,7 +73,7 @@ def test_a_stiff_hand_sees_the_same_share_however_it_turns(hand, scene):
     turn = rotation.from_axis_angle(torch.tensor([0.6, 0.0, 0.8]), torch.tensor(1.9))
     before, after = (seen(hand, crop, posed) for posed in (crop.posed.vertices, crop.posed.vertices @ turn.T))
     off = (before - after).abs()
-    assert float(off.quantile(0.99)) < 1e-4
+    assert float(off.quantile(0.99)) < 5e-4  # a step of rounding in a depth buffer, where hardly any light arrives
     assert float(off.max()) < 0.01  # beside an edge, rounding hides a vertex of the coarse mesh from one direction
 
 
@@ -240,19 +249,20 @@ def test_an_older_file_looks_as_before_in_its_photo_and_gains_elsewhere(hand, sc
         assert float((read.pose(opened).colors / avatar.pose(opened).colors).min()) < 0.8
 
 
-def test_a_file_without_light_through_the_skin_looks_as_before_in_its_photo(hand, scene, tmp_path, monkeypatch):
+@pytest.mark.parametrize("version", [6, 7])
+def test_a_file_with_other_light_in_hollows_looks_as_before_in_its_photo(hand, scene, tmp_path, monkeypatch, version):
     crop, truth, pose = scene
     old = avatar_of(hand, truth, pose, crop.camera, EVEN)
     old.save(tmp_path / "today.safetensors")
     with monkeypatch.context() as before:
-        before.setattr(avatar_file, "VERSION", 6)
-        before.setattr(posing, "arriving", bounced)
+        before.setattr(avatar_file, "VERSION", version)
+        before.setattr(posing, "arriving", functools.partial(arriving_before, version))
         old.save(tmp_path / "old.safetensors")
         wanted = old.pose(old.source_pose).colors
     read, unchanged = (Avatar.load(tmp_path / f"{name}.safetensors") for name in ("old", "today"))
     darkest = posing.MIN_LIGHT ** (1 / posing.GAMMA)
     torch.testing.assert_close(read.pose(old.source_pose).colors, wanted, atol=darkest, rtol=0)
-    assert float((unchanged.pose(old.source_pose).colors - wanted).max()) > 0.01
+    assert float((unchanged.pose(old.source_pose).colors - wanted).abs().max()) > 0.01
 
 
 def test_detail_that_takes_back_a_shadow_is_no_white_skin(hand, scene):

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from oasis_warp.avatar.anchors import vertex_to_gaussians
-from oasis_warp.avatar.sky import arriving, bounced, exposure, harmonic_basis, largest_nearby
+from oasis_warp.avatar.sky import arriving, arriving_before, exposure, harmonic_basis, largest_nearby
 from oasis_warp.core import rotation, surface
 from oasis_warp.core.mirror import mirror_light, mirror_points
 from oasis_warp.core.types import CanonicalGaussians, Gaussians, HandLight
@@ -41,6 +41,9 @@ gloss, or another part of the hand. Set by eye on one thumb-up photo with gashes
 MAX_DETAIL = 0.3
 """Difference of the logarithms of colours up to which detail is skin where it goes against the shade: bright beside a
 shadow that is a pixel off, skin would be white where that shadow goes."""
+MOST_DETAIL = 0.5
+"""Largest difference of the logarithms of colours by which detail changes the skin. Gaussians finer than the photo's
+shadows overshoot where a shadow ends: one spot of skin was black. The rest is shade of the photo."""
 MIN_LIGHT = 1e-6
 """Least share of the light that shade makes up for: deep in a fist hardly any arrives."""
 MIN_COLOR = 1e-3
@@ -116,24 +119,24 @@ def view_share(photo_view: Float[Tensor, "3"], view: Float[Tensor, "*B 3"]) -> F
     return (((photo_view * view).sum(-1) - OTHER_VIEW) / (SAME_VIEW - OTHER_VIEW)).clamp(0, 1)
 
 
-def with_self_occlusion(
+def with_todays_light(
+    version: int,
     light: HandLight,
     albedo: Float[Tensor, "3"],
     rest: Float[Tensor, "V 3"],
     photo: Float[Tensor, "V 3"],
     faces: Int[Tensor, "F 3"],
 ) -> HandLight:
-    """Convert the light of an older file to today's rules of what the hand hides and of light through the skin.
+    """Convert the light of a file of an older version to today's rules of what the hand hides.
 
-    The photo's own view stays as it is: there the shade makes up for the difference. Elsewhere the shade goes. Up to
-    version 4 nothing was hidden, and `albedo` is None; up to version 6 no light came through the skin.
+    The photo's own view stays as it is: there the shade makes up for the difference. Elsewhere the shade goes.
     """
     hidden = light._replace(albedo=albedo)
     on = posed_lighting(rest, photo, faces, hidden)
     assert on.exposure is not None, "there is an albedo"
-    before = 1 if light.shade is None else light.shade
-    arrived = torch.ones_like(albedo) if light.albedo is None else bounced(on.exposure[..., 1:], albedo)
-    shade = before * (arrived.clamp_min(MIN_LIGHT) / arriving(on.exposure[..., 1:], albedo)).pow(1 / GAMMA)
+    arrived = arriving_before(version, on.exposure[..., 1:], albedo).clamp_min(MIN_LIGHT)
+    factor = (arrived / arriving(on.exposure[..., 1:], albedo)).pow(1 / GAMMA)
+    shade = factor if light.shade is None else light.shade * factor
     return hidden._replace(shade=shade, facing=on.normals if light.facing is None else light.facing)
 
 
@@ -237,7 +240,7 @@ def with_photo_colors(
     """The same, with the colours that the photo shows of some Gaussians, in the shade that these have.
 
     A share `trust` of the change becomes colour, all of it if not given; the rest becomes shade. With `trust`, a change
-    that only undoes the present shade does not become colour either.
+    that only undoes the present shade does not become colour either, nor does more than `MOST_DETAIL`.
     """
     if canonical.shade is None:
         return canonical._replace(colors=canonical.colors.masked_scatter(changed[:, None], shown))
@@ -246,7 +249,7 @@ def with_photo_colors(
         news = (shown.clamp_min(MIN_COLOR) / (canonical.colors[changed] * shade).clamp_min(MIN_COLOR)).log()
         most = -shade.log()
         back = (news - news.clamp(-MAX_DETAIL, MAX_DETAIL)).clamp(most.clamp(max=0), most.clamp(min=0))
-        shade = shade * (back + (1 - trust) * (news - back)).exp()
+        shade = shade * (news - (trust * (news - back)).clamp(-MOST_DETAIL, MOST_DETAIL)).exp()
     colors, shade = split_shade(shown, shade)
     return canonical._replace(
         colors=canonical.colors.masked_scatter(changed[:, None], colors),

@@ -20,12 +20,16 @@ LOBE = (1.0, 2 / 3, 1 / 4)
 """What a cosine lobe leaves of each degree of harmonics (Ramamoorthi and Hanrahan 2001)."""
 
 
+IN_HOLLOWS = (1.0, 1.2, 1.35)
+"""Powers of the shares of red, green and blue light that a model of bounces says arrive in hollows: photos are darker
+there, and redder. Chosen on 41 photos of same_hand; `python -m studies hollows` measures it (docs/avatar.md)."""
+LEAST_LIGHT = (0.05, 0.02, 0.01)
+"""Share of red, green and blue light that reaches skin which sees no sky, where two fingers touch: black lines of the
+width of a coarse face looked like gaps. Set by eye on two photos of same_hand."""
 THROUGH_SKIN = (0.15, 0.07, 0.04)
-"""Share of the red, green and blue light that reaches skin which sees no sky, where two fingers touch. At a distance s
-from the line of contact of two cylinders of radius R the exposure is about 1.5 (s / R)^2, and light that entered there
-has travelled on below the skin: by 3.7, 1.4 and .7 mm in the model of Jensen et al. 2001. With R = 8 mm, and half of
-the distance in red, which reaches past small angles, that is .16, .09 and .02; rounded by hand to a little less
-colour."""
+"""The same in files of version 7, which had no other powers."""
+NOTHING_HIDDEN, SCATTERED = 4, 7
+"""Last file version whose hands hid nothing of the light, and the one with `THROUGH_SKIN`."""
 NEARBY = 2
 """Rings of coarse faces, of 5 mm each, within which what hid the sky in the photo counts as having moved: pixels that
 may show it instead of the skin reach 5 mm past its outline (`adaptation.reliability.BEHIND_REACH`), and a fit is some
@@ -133,15 +137,23 @@ def bounced(exposure: Float[Tensor, "*B 3"], albedo: Float[Tensor, "3"]) -> Floa
 
 def arriving(exposure: Float[Tensor, "*B 3"], albedo: Float[Tensor, "3"]) -> Float[Tensor, "*B 3"]:
     """The share of the light that arrives directly, after bounces, or through the skin beside it."""
-    through = _through_skin(exposure.device).to(exposure)
+    least, powers = _constants(exposure.device).to(exposure)
+    return least + (1 - least) * bounced(exposure, albedo) ** powers
+
+
+def arriving_before(version: int, exposure: Float[Tensor, "*B 3"], albedo: Float[Tensor, "3"]) -> Float[Tensor, "*B 3"]:
+    """`arriving` by the rules of avatar files of an older version."""
+    if version <= NOTHING_HIDDEN:
+        return torch.ones_like(exposure)
+    through = exposure.new_tensor(THROUGH_SKIN if version == SCATTERED else (0.0, 0.0, 0.0))
     return through + (1 - through) * bounced(exposure, albedo)
 
 
 @functools.cache
-def _through_skin(device: torch.device) -> Float[Tensor, "3"]:
-    """`THROUGH_SKIN`; kept, because a graph must not copy it from the host."""
+def _constants(device: torch.device) -> Float[Tensor, "2 3"]:
+    """`LEAST_LIGHT` and `IN_HOLLOWS`; kept, because a graph must not copy them from the host."""
     with torch.inference_mode(False):
-        return torch.tensor(THROUGH_SKIN, device=device)
+        return torch.tensor([LEAST_LIGHT, IN_HOLLOWS], device=device)
 
 
 DEGREES = (0, 1, 1, 1, 2, 2, 2, 2, 2)

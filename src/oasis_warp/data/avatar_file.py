@@ -1,10 +1,10 @@
 """The avatar file: safetensors with a JSON header, so that loading one executes no code.
 
 The tables `TENSORS`, `LIGHT`, `SHADE`, `FINE_SHADE`, `ALBEDO`, `DOUBT` and `INVENTED` describe the tensors. The
-metadata have one entry, "oasis-avatar": the header, a JSON object whose `version` is 7, or less in files without light
-(1), shade (2), shade per Gaussian (3), light that the hand hides from itself (4), doubt (5) or light through the skin
-(6). Files of newer versions are refused. There is only one entry because safetensors writes several in any order, and
-the same avatar must give the same bytes.
+metadata have one entry, "oasis-avatar": the header, a JSON object whose `version` is 8, or less in files without light
+(1), shade (2), shade per Gaussian (3), light that the hand hides from itself (4), doubt (5), light through the skin (6)
+or dark hollows (7). Files of newer versions are refused. There is only one entry because safetensors writes several in
+any order, and the same avatar must give the same bytes.
 """
 
 import json
@@ -26,9 +26,9 @@ from oasis_warp.data.output_files import write_file
 from oasis_warp.data.tensor_file import open_tensors, tensor_shapes
 
 FORMAT = "oasis-avatar"
-VERSION = 7
-LIGHT_SCATTERED = 7
-"""First version whose light also arrives through the skin."""
+VERSION = 8
+DARK_HOLLOWS = 8
+"""First version whose light arrives in hollows as in photos."""
 HARMONICS = (4, 9)
 """Rows that `light.harmonics` may have."""
 UNIT_TOLERANCE = 1e-3

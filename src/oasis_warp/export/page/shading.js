@@ -8,7 +8,7 @@ const SAME_POSE = 0.9, OTHER_POSE = 0.5; // shares of the hand that face as in t
 const SAME_VIEW = Math.cos((10 * Math.PI) / 180), OTHER_VIEW = Math.cos((35 * Math.PI) / 180);
 const SAME_SKY = 0.08, OTHER_SKY = 0.25; // changes of the share of the sky that skin sees, as in avatar/pose.py
 const SAME_BESIDE = 0.02, OTHER_BESIDE = 0.08; // the same where the photo is in doubt
-const THROUGH_SKIN = [0.15, 0.07, 0.04]; // light that reaches skin which sees no sky, as in avatar/sky.py
+const IN_HOLLOWS = [1, 1.2, 1.35], LEAST_LIGHT = [0.05, 0.02, 0.01]; // of light in hollows, as in avatar/sky.py
 const WEAK = 0.3, DEEP = 0.6; // differences of shade from 1, up to which it is the skin's own, and from which it is not
 const MAP_SEEN = [0.36, 0.6, 0.57], MAP_INVENTED = [0.89, 0.55, 0.28], MAP_SKIN = 0.35; // colours of the map; share of skin in it
 
@@ -76,7 +76,8 @@ function lightVertex({ harmonics: h, limits }, bounce, x, y, z, exposure, factor
     got = Math.min(Math.max(got, limits[c]), limits[3 + c]);
     if (bounce) {
       const e = exposure[at + 1 + c], [p, q, r] = bounce[c];
-      got *= THROUGH_SKIN[c] + (1 - THROUGH_SKIN[c]) * Math.max(e, ((e * p + q) * e + r) * e); // bounces: Jimenez et al. 2016
+      const bounced = Math.max(e, ((e * p + q) * e + r) * e); // Jimenez et al. 2016
+      got *= LEAST_LIGHT[c] + (1 - LEAST_LIGHT[c]) * bounced ** IN_HOLLOWS[c];
     }
     factors[at + c] = got ** (1 / GAMMA);
   }
