@@ -266,12 +266,16 @@ def test_a_file_with_other_light_in_hollows_looks_as_before_in_its_photo(hand, s
 
 
 def test_detail_that_takes_back_a_shadow_is_no_white_skin(hand, scene):
-    """Bright detail beside a crease that lies a pixel off stayed white when the crease's shade was gone."""
+    """Bright detail beside a crease that lies a pixel off stayed white when the crease's shade was gone.
+
+    Dark detail that overshot was a black hole in the skin.
+    """
     _, truth, _ = scene
     colors, shade = torch.full_like(truth.colors, 0.5), torch.full_like(truth.colors, 0.3)
     shaded, every = truth._replace(colors=colors, shade=shade), torch.ones(len(colors), dtype=torch.bool)
     trust = torch.ones(len(colors), 1)
-    for shown, wanted in ((0.5, 0.5 * math.exp(0.3)), (0.16, 0.5 * 0.16 / 0.15), (0.075, 0.25)):
+    cases = ((0.5, 0.5 * math.exp(0.3)), (0.16, 0.5 * 0.16 / 0.15), (0.1, 0.1 / 0.3), (0.001, 0.5 * math.exp(-0.5)))
+    for shown, wanted in cases:
         made = with_photo_colors(shaded, every, torch.full_like(colors, shown), trust)
         assert made.shade is not None
         torch.testing.assert_close(made.colors, torch.full_like(colors, wanted))

@@ -107,6 +107,16 @@ def test_flipped_bits_in_a_real_cache_are_found_and_built_anew(tmp_path):
     assert [path.read_bytes() for path in objects] == before
 
 
+def test_a_program_that_has_started_warp_leaves_no_kernels_that_later_ones_warn_of(tmp_path):
+    """They lay in the folder itself instead of that of Warp's version, and every later process warned of them."""
+    call = "import warp; warp.init()\nfrom oasis_warp.ops._runtime.launch import start; start(); print(warp.config."
+    called = subprocess.run(
+        [sys.executable, "-c", f"{call}kernel_cache_dir)"], env={**os.environ, "OASIS_WARP_CACHE": str(tmp_path)},
+        check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    assert Path(called.stdout.splitlines()[-1]) == tmp_path / wp.config.version
+
+
 def test_what_a_killed_build_has_left_is_removed_after_an_hour(tmp_path, monkeypatch):
     monkeypatch.setenv("OASIS_WARP_CACHE", str(tmp_path))
     gone = 1 << 23  # more than Linux counts

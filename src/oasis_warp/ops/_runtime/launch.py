@@ -9,6 +9,7 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -59,9 +60,11 @@ def start() -> None:
         if _started:
             return
         wp.config.log_level = wp.LOG_WARNING
-        wp.config.kernel_cache_dir = str(writable_cache())
+        wp.config.kernel_cache_dir = cache = str(writable_cache())
         with nullcontext() if torch.cuda.is_available() else _native_stderr_closed():
             wp.init()
+        if wp.config.kernel_cache_dir == cache:  # the program had initialised Warp, which then adds no version to it
+            wp.config.kernel_cache_dir = str(Path(cache) / wp.config.version)
         _started = True
 
 
