@@ -14,7 +14,7 @@ from oasis_warp.avatar.pose import GAMMA, posed_lighting
 from oasis_warp.avatar.sky import arriving, harmonic_basis
 from oasis_warp.core.types import HandCrop
 from oasis_warp.data.photo import read_photo
-from oasis_warp.evaluation.views import draw, views_of
+from oasis_warp.evaluation import views
 from oasis_warp.reconstruction import reconstruct
 from studies.harness import AvatarOptions, Row, measured
 from studies.inputs import PHOTOS, photos_below
@@ -43,8 +43,8 @@ def measure_photo(path: Path, options: Options) -> list[Row]:
     light = avatar.light
     if avatar.side == "left" or light is None or light.albedo is None:
         return []
-    photo = views_of(avatar)[0]
-    drawn, posed, faces = draw(avatar, photo), avatar.mesh(photo.pose), avatar.hand.faces
+    photo = views.views_of(avatar)[0]
+    drawn, posed, faces = views.draw(avatar, photo), avatar.mesh(photo.pose), avatar.hand.faces
     above = torch.ones_like(drawn.alpha.squeeze(-1))
     crop = HandCrop(drawn.image.clamp(0, 1), drawn.alpha.squeeze(-1), above, photo.camera, avatar.rest, posed)
     seen, on = observe(avatar.hand, crop), posed_lighting(avatar.rest.vertices, posed.vertices, faces, light)
