@@ -233,7 +233,7 @@ def test_the_hand_beyond_the_fade_keeps_its_bits_and_the_cap_goes_with_the_wrist
     posed = skin(hand, rest_hand(hand, torch.zeros(hand.shape_basis.shape[-1])), fist).vertices
     still, moved = (pose_gaussians(after, hand.faces, rest, to).means for to in (rest, posed))
     shift, arm = (moved - still).norm(dim=1), arm_of(hand, rest, after)
-    assert shift[arm].max() < 0.008
+    assert shift[arm].max() < 0.016  # at its end, 12 cm away: flesh moves the rim a little
     shift[arm] = 0
     assert shift[cap].max() < 0.004  # the rim itself moves by less than that
 
@@ -243,8 +243,9 @@ def test_the_arm_fades_from_the_rim_on_and_hides_the_cap_along_it(hand, hands):
     rest, _, after = hands
     axis, middle, arm = rim_axis(rest, hand.rim), rest[hand.rim].mean(0), arm_of(hand, rest, after)
     height = (centers(hand, rest, after)[arm] - middle) @ axis
-    assert 0 < height.min() < 0.004 and 0.054 < height.max() < ARM_LENGTH
-    assert after.opacities[arm][height < 0.005].min() > 0.6 and after.opacities[arm][height > 0.054].max() < 0.03
+    end = 0.9 * ARM_LENGTH
+    assert 0 < height.min() < 0.004 and end < height.max() < ARM_LENGTH
+    assert after.opacities[arm][height < 0.005].min() > 0.6 and after.opacities[arm][height > end].max() < 0.03
     camera = orbit_camera(torch.cat([rest, rest + ARM_LENGTH * axis]), 0.0, size=128)
     alpha = render(pose_gaussians(after, hand.faces, rest, rest), camera).alpha
     seen = []

@@ -43,9 +43,10 @@ DARKEST = 0.02
 CONTRAST = 0.045
 """Largest standard deviation of that detail's logarithm, what palms have from one to four pixels of 256: more is the
 edge of a shadow or of a sleeve."""
-ARM_LENGTH = 0.06
-"""The stretch past the rim over which an arm fades out [m]: a hand that ends at once looks sawn off."""
-ARM_GROWTH = 0.1
+ARM_LENGTH = 0.12
+"""The stretch past the rim over which an arm fades out [m]: a hand that ends at once looks sawn off, and one whose arm
+fades within the picture, as 6 cm did beside a thumb that points up, looks cut out."""
+ARM_GROWTH = 0.2
 """How much wider the arm is at its end than at the rim."""
 ARM_STEP, COARSER = 0.001, 3.0
 """Distance of the arm's Gaussians at the rim [m], half of that of the skin's vertices, and how much larger it is at the
@@ -54,7 +55,7 @@ FILL_STEP = 0.004
 """Distance of the balls that fill the arm [m]."""
 ARM_LAYERS, FILL_LAYERS = 2.5, 12.0
 """Numbers of the arm's Gaussians and of balls one behind the other, each of them so much fainter. There are more balls,
-so the arm is opaque for 3 cm and then fades."""
+so the arm is opaque for 6 cm and then fades."""
 RIM_PARTS = -1 / 3, 0.0, 1 / 3
 """Places of Gaussians along the edges at a vertex of the rim, as shares of the edge: one on each vertex makes teeth."""
 RIM_SPREAD = 0.8

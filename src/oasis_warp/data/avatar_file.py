@@ -59,7 +59,7 @@ TENSORS = {
     "surface_offsets": Entry(torch.float32, ("V", 3), -0.05, 0.05),
     # The Gaussians at rest: P bound to vertices, then Q to faces.
     "gaussians.vertex_index": Entry(torch.int64, ("P",), 0, MAX_NUMBER),
-    "gaussians.offsets": Entry(torch.float32, ("P", 3), -0.1, 0.1),
+    "gaussians.offsets": Entry(torch.float32, ("P", 3), -0.2, 0.2),
     "gaussians.face_index": Entry(torch.int64, ("Q",), 0, MAX_NUMBER),
     "gaussians.barycentrics": Entry(torch.float32, ("Q", 3), *SHARE),
     "gaussians.quats": Entry(torch.float32, ("N", 4), -2, 2),
