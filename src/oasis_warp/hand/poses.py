@@ -35,7 +35,7 @@ _FIST: dict[str, Finger] = {
     "index": (78, 110, 58, -4),
     "middle": (86, 110, 59, -2),
     "ring": (79, 110, 62, 4),
-    "little": (71, 108, 64, 6),
+    "little": (70, 106, 62, 6),
 }
 
 # Flexion is relative to a straight finger. Abduction, and all angles of the thumb's base, are relative to rest and
@@ -47,8 +47,8 @@ _THUMBS: dict[str, Thumb] = {
     "fist": (30, 14, -14, 42, 70),
     "pinch": (35, 10, -10, 2, 5),
     "thumbs_up": (-14, 16, 0, 3, -10),
-    "victory": (45, 15, -18, 37, 44),
-    "point": (35, 17, -18, 43, 61),
+    "victory": (43, 15, -18, 37, 44),
+    "point": (33, 17, -18, 43, 61),
     "ok": (32, 10, -11, 13, 12),
 }
 
