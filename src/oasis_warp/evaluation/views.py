@@ -12,7 +12,7 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 
 from oasis_warp.avatar.appearance import label_regions
 from oasis_warp.avatar.observation import facing, inner_mask, observe
-from oasis_warp.avatar.wrist import ARM_LENGTH, rim_axis
+from oasis_warp.avatar.wrist import ARM_GROWTH, ARM_LENGTH, rim_axis
 from oasis_warp.core.camera import camera_center, crop_camera, orbit_camera, project
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.surface import face_normals
@@ -145,7 +145,7 @@ def wrist_end(hand: HandModel, vertices: Float[Tensor, "V 3"], camera: Camera) -
     """Pixels within `WRIST_REACH` of the opening of the wrist and of the arm that fades from there."""
     index = hand.rim.to(vertices.device)
     edge, arm = vertices[index], ARM_LENGTH * rim_axis(vertices, index)
-    rim = torch.cat([edge, edge + arm])
+    rim = torch.cat([edge, edge + arm + ARM_GROWTH * (edge - edge.mean(0))])
     viewed = Camera(camera.viewmat.to(rim), camera.K.to(rim), camera.width, camera.height)
     xy, depth = project(viewed, rim)
     plane = np.zeros((camera.height, camera.width), np.uint8)
