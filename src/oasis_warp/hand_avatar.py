@@ -371,8 +371,8 @@ class Avatar:
         if self.light is None or (self.light.albedo is None and version > NOTHING_HIDDEN):
             return self
         albedo = self._mean_albedo(self.light.even) if self.light.albedo is None else self.light.albedo
-        surface = self._photo_surface()
-        light = with_todays_light(version, self.light, albedo, self.rest.vertices, surface, self.hand.faces)
+        photo = self._photo_surface()
+        light = with_todays_light(version, self.light, albedo, self.rest.vertices, photo, self.hand.faces)
         return self.with_looks(self.gaussians, light)
 
 

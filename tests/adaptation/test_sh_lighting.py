@@ -388,6 +388,10 @@ def test_marks_are_told_from_light_by_what_lies_across():
     assert float(mark_probability(torch.tensor([[-1.0, -0.6, -0.1]]))) == 1
     assert float(mark_probability(torch.tensor([[0.65, 0.75, 0.85]]))) == 1  # white paint on skin that is not pale
     assert float(mark_probability(torch.zeros(1, 3))) == 0
+    deep = torch.tensor([[-1.06, -1.75, -1.67]])  # a shadow between fingers, which became a hole in the opened palm
+    assert float(mark_probability(deep)) < 0.2
+    polish, ink = torch.tensor([[-0.7, -3.0, -2.2]]), torch.tensor([[-2.3, -1.8, -1.5]])
+    assert float(mark_probability(polish)) == 1 and float(mark_probability(ink)) == 1
 
 
 def test_ink_on_single_gaussians_is_no_mark(hand, albedo_scene):

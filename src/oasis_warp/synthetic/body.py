@@ -36,8 +36,7 @@ ATLAS_ARM_BIAS = 0.7
 SKIN, SLEEVE, BAND, RING = range(4)
 """Materials of faces."""
 KNUCKLE_RISE = (2.0, 1.7, 0.8)
-"""How far each knuckle of a finger stands out farther on the boniest hands than on others when bent by 90 degrees, from
-the palm outwards [mm]."""
+"""Height of each knuckle of a finger, from the palm outwards, bent by 90 degrees and for a strength of 1 [mm]."""
 
 
 @dataclass(frozen=True)
