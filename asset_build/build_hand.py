@@ -64,6 +64,7 @@ def build(n_samples: int) -> dict[str, np.ndarray]:
     base_uv, hd_uv = (
         UV_MARGIN + (1 - 2 * UV_MARGIN) * (uv - uv_low) / uv_span for uv in (source.uv, hd.uv_operator @ source.uv)
     )
+    weights = rig.steady_wrist(weights, closed, rim)
     single, half = np.float32, np.float16
     return {
         "v_template": closed.astype(single),

@@ -21,6 +21,7 @@ from elastic_hand.correctives import fit_to_flesh, strengths
 from elastic_hand.solid import MILLIMETRES, skinned
 from hand_build.anatomy import Array
 from hand_build.knuckles import knuckle_shapes
+from hand_build.rig import moving_share
 from hand_build.source import write_npz
 
 from oasis_warp.core.hand_model import HandModel
@@ -60,8 +61,10 @@ def main() -> None:
     made = simulations.load(args.flesh)
     learnt, judged = ([m for m in made if m.part == part] for part in (simulations.TRAIN, simulations.HELD_OUT))
     shapes = fit_to_flesh(hand, subdivision, learnt, simulations.gestures(hand, N_GESTURES, SEED))
-    rest, faces = arrays["v_template"][:n_base].astype(float) * MILLIMETRES, arrays["faces"].astype(np.int64)
-    raised = shapes + knuckle_shapes(hand, rest, np.asarray(igl.per_vertex_normals(rest, faces)))
+    rest, faces = arrays["v_template"][:n_base].astype(float), arrays["faces"].astype(np.int64)
+    normals = np.asarray(igl.per_vertex_normals(rest, faces))
+    shapes = shapes * moving_share(rest, igl.boundary_loop(faces))[:, None]
+    raised = shapes + knuckle_shapes(hand, rest * MILLIMETRES, normals)
     correctives = np.zeros((n_base + 1, 3, len(shapes)), np.float16)  # the last vertex only closes the wrist
     correctives[:n_base] = raised.transpose(1, 2, 0) / MILLIMETRES
     digest = write_npz(args.out, {**arrays, "correctives": correctives})

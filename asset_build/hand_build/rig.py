@@ -15,6 +15,8 @@ HEAT = 1.0
 SMALLEST_WEIGHT = 0.01
 """Weights below are dropped. Keeping only the four largest instead would move the skin of a fist by up to 3 mm."""
 REGRESSOR_REACH = 160
+STEADY = 0.008, 0.025
+"""Distances from the wrist's rim up to which skin does not follow the fingers, and from which it does wholly [m]."""
 """Number of nearest vertices that a joint may be regressed from."""
 
 # Anatomical ranges of flexion, abduction and twist [degrees]; 0 flexion is a straight finger, the thumb's base counts
@@ -99,6 +101,19 @@ def skinning_weights(vertices: Array, faces: Index, points: Array, phalanx_share
         weights[:, FIRST[finger] : FIRST[finger] + 3] = whole[:, [k]] * phalanx_shares[finger]
     weights[weights < SMALLEST_WEIGHT] = 0
     return weights / weights.sum(1, keepdims=True)
+
+
+def moving_share(vertices: Array, rim: Index) -> Array:
+    """How far skin follows the fingers, by its distance from the rim of the wrist, which the arm continues, [V]."""
+    apart = np.linalg.norm(vertices[:, None] - vertices[rim], axis=2).min(1)
+    t = np.clip((apart - STEADY[0]) / (STEADY[1] - STEADY[0]), 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def steady_wrist(weights: Array, vertices: Array, rim: Index) -> Array:
+    """Skinning weights whose share of the fingers ends at the wrist: an arm of 12 cm swayed by 14 mm with the thumb."""
+    share = moving_share(vertices, rim)[:, None]
+    return share * weights + (1 - share) * np.eye(len(JOINTS))[0]
 
 
 def joint_regressor(hands: Array, joints: Array, template: Array, template_joints: Array) -> Array:
