@@ -11,7 +11,7 @@ import torch
 from datasets.trees import WRITERS
 
 from oasis_warp.avatar.appearance import label_regions
-from oasis_warp.avatar.wrist import ARM_LENGTH, rim_axis
+from oasis_warp.avatar.wrist import ARM_GROWTH, ARM_LENGTH, rim_axis
 from oasis_warp.cli import evaluate, main
 from oasis_warp.core.camera import orbit_camera, project
 from oasis_warp.core.color import cielab, linear_light, luminance
@@ -73,7 +73,8 @@ def test_the_outside_of_the_skin_counts_and_the_inside_of_the_wrist_does_not(han
 
 def test_the_end_of_the_wrist_is_where_its_rim_is_seen(hand):
     edge = hand.template[hand.rim]
-    ends = torch.cat([edge, edge + ARM_LENGTH * rim_axis(hand.template, hand.rim)])  # of the arm that fades
+    wider = edge + ARM_GROWTH * (edge - edge.mean(0))
+    ends = torch.cat([edge, wider + ARM_LENGTH * rim_axis(hand.template, hand.rim)])  # of the arm that fades
     camera = orbit_camera(torch.cat([hand.template, ends]), 0.0, size=256)
     end = wrist_end(hand, hand.template, camera)
     rim, depth = project(camera, ends)
