@@ -9,15 +9,16 @@ import scipy.sparse as sp
 import scipy.sparse.linalg
 
 from hand_build.anatomy import FINGERS, FIRST, JOINTS, Array, Index, bone_ends, finger_chain, unit
+from oasis_warp.synthetic.body import rising
 
 HEAT = 1.0
 """Strength c of the pull to the nearest bone; larger makes the weights sharper."""
 SMALLEST_WEIGHT = 0.01
 """Weights below are dropped. Keeping only the four largest instead would move the skin of a fist by up to 3 mm."""
 REGRESSOR_REACH = 160
+"""Number of nearest vertices that a joint may be regressed from."""
 STEADY = 0.008, 0.025
 """Distances from the wrist's rim up to which skin does not follow the fingers, and from which it does wholly [m]."""
-"""Number of nearest vertices that a joint may be regressed from."""
 
 # Anatomical ranges of flexion, abduction and twist [degrees]; 0 flexion is a straight finger, the thumb's base counts
 # from rest. Clinical tables of flexion with some slack; the thumb's base, sideways play and twist are judgement.
@@ -105,9 +106,7 @@ def skinning_weights(vertices: Array, faces: Index, points: Array, phalanx_share
 
 def moving_share(vertices: Array, rim: Index) -> Array:
     """How far skin follows the fingers, by its distance from the rim of the wrist, which the arm continues, [V]."""
-    apart = np.linalg.norm(vertices[:, None] - vertices[rim], axis=2).min(1)
-    t = np.clip((apart - STEADY[0]) / (STEADY[1] - STEADY[0]), 0, 1)
-    return t * t * (3 - 2 * t)
+    return rising(np.linalg.norm(vertices[:, None] - vertices[rim], axis=2).min(1), *STEADY)
 
 
 def steady_wrist(weights: Array, vertices: Array, rim: Index) -> Array:

@@ -19,7 +19,7 @@ from oasis_warp import __version__
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.processes import worker_pool
 from oasis_warp.data.output_files import write_file
-from oasis_warp.synthetic.body import ARM_ROWS, arm_rows, body_on, bundled_body, device_name
+from oasis_warp.synthetic.body import ARM_ROWS, arm_rows, body_on, bundled_body, device_name, rising
 from oasis_warp.synthetic.identity import Identity, Population, sample_identity
 from oasis_warp.synthetic.ops.skin_shading import surface_state
 from oasis_warp.synthetic.ops.surface_patterns import NoiseField, surface_noise
@@ -215,11 +215,6 @@ def _finish_person(plan: SkinPlan, device: str) -> Person:
     )
 
 
-def _step(low: float, high: float, x: np.ndarray) -> np.ndarray:
-    t = np.clip((x - low) / (high - low), 0, 1)
-    return t * t * (3 - 2 * t)
-
-
 @functools.cache
 def relief_forms() -> np.ndarray:
     """Heights of the hand's vertices [mm], [V, 4]: constant, and per unit of bony, tendons, and bony x tendons."""
@@ -228,24 +223,24 @@ def relief_forms() -> np.ndarray:
     points, normals = body.rest[:n].double().numpy(), body.normals[:n].double().numpy()
     weights = body.finger_weights[:n].double().numpy()
     common, bony, tendons, both = out = np.zeros((4, n))
-    back, palm = _step(0.1, 0.7, normals[:, 1]), _step(0.1, 0.7, -normals[:, 1])
+    back, palm = rising(normals[:, 1], 0.1, 0.7), rising(-normals[:, 1], 0.1, 0.7)
 
     def blob(center: np.ndarray, radius: float | list[float | int]) -> np.ndarray:
         return np.exp(-(((points - center) / radius) ** 2).sum(1))
 
     for finger, bones in enumerate(body.bones):
-        here = _step(0.3, 0.7, weights[:, finger])
+        here = rising(weights[:, finger], 0.3, 0.7)
         for place, bone in enumerate(bones):
             along = (points - bone.origin) @ bone.along
             up = normals @ bone.back
             level = 1 - np.abs(up)
             if place or finger == 4:
                 joint = np.exp(-((along / 4.5) ** 2)) * here
-                valley = 0.65 * np.exp(-((along / 2.2) ** 2)) * _step(0.1, 0.6, -up)
+                valley = 0.65 * np.exp(-((along / 2.2) ** 2)) * rising(-up, 0.1, 0.6)
                 common += joint * (0.3 * level - valley)
-                bony += joint * (0.5 * _step(-0.2, 0.4, up) + 0.5 * level)
+                bony += joint * (0.5 * rising(up, -0.2, 0.4) + 0.5 * level)
             pad = np.exp(-(((along - 0.52 * bone.length) / (0.30 * bone.length)) ** 2))
-            common += here * _step(0.1, 0.7, -up) * 0.85 * pad
+            common += here * rising(-up, 0.1, 0.7) * 0.85 * pad
             if place < 2:  # phalanges are waisted between the joints
                 common -= here * level * 0.15 * pad
                 bony -= here * level * 0.45 * pad
@@ -256,7 +251,7 @@ def relief_forms() -> np.ndarray:
         bony += back * 1.7 * blob(knuckle + up * 9 + _BACK_OF_KNUCKLE, 8.5)
         s = np.clip((points - knuckle) @ -knuckle / (knuckle @ knuckle), 0, 1)
         off = np.linalg.norm((points - knuckle * (1 - s)[:, None])[:, [0, 2]], axis=1)
-        tendon = _TENDONS[i] * back * _step(1.0, 0.25, s) * 1.2 * np.exp(-((off / 2.6) ** 2))
+        tendon = _TENDONS[i] * back * rising(s, 1.0, 0.25) * 1.2 * np.exp(-((off / 2.6) ** 2))
         tendons += 0.3 * tendon
         both += 0.9 * tendon
         if i < 3:
