@@ -33,7 +33,7 @@ MARGIN = 0.00075
 """How far skin is moved out [m]: edges between vertices that just touch would still cross."""
 FADES = 0.5
 """Share of the skin around a vertex that touches, below which its shift fades: that at the edge of a contact."""
-ROUNDS = 4
+ROUNDS = 6
 """Rounds of contact resolution; later ones make up for what the mean took from the first."""
 PAD = 0.003
 """Margin around a part's box [m]: normals of the flesh below differ from the part's own and lead that far aside."""

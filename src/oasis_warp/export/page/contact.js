@@ -4,7 +4,7 @@
 const DEEPEST = 0.005, ASIDE = 0.003, PUSH = 0.00075, PAD = 0.003; // metres
 const OPPOSED = -0.3, PARTS_OPPOSED = 0.3; // cosines of normals
 const FADES = 0.5; // share of the skin around a vertex that touches, below which its shift fades
-const ROUNDS = 4;
+const ROUNDS = 6;
 const FREE = Math.PI / 18; // change of an angle from the photo's pose
 const BOX = 15; // numbers a part: corners of its skin, corners of its skin with the flesh under it, normal
 
