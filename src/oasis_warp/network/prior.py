@@ -76,42 +76,33 @@ def clamp_to_surface(prediction: Prediction, on: RestSurface) -> Prediction:
     )
 
 
-COVERING_OPACITY = 0.8
-"""Opacity of a vertex's Gaussian that covers the surface. The network gives as much to nine in ten on faces; half of
-those on vertices have less than .35, and where a bent finger stretched its skin a quarter of what was drawn was the
-inside of its other side."""
+DISC_SPREAD = 1.2
+"""Standard deviations of the discs below the surface over those of a vertex's anchor. With 1 skin that bends has gaps,
+with 1.4 more of the discs stands out of outlines: chosen on the sides and poses of five photos of same_hand."""
 
 
 def cover_surface(prediction: Prediction, on: RestSurface) -> Prediction:
-    """The prediction of one hand with opaque Gaussians on all vertices, but for the fade at the wrist.
+    """The prediction of one hand with an opaque disc below the surface at every vertex, but for the fade at the wrist.
 
-    Faint ones were never seen in training: they stand out of the skin and are black as often as not. For what they lack
-    of `COVERING_OPACITY` they become their anchors' discs in the colours of the faces around, below the surface: on it
-    the discs would be teeth in outlines. Without Gaussians on faces nothing changes.
+    Faces carry the skin; the discs, in the colours of the faces around, close its gaps where a bent finger stretches
+    it. The network's own Gaussians of vertices are left out. Half of them are so faint that training never saw them,
+    and all lie up to `MAX_ALONG` aside: where the skin bends more than in the photo they stand out of it, as fog around
+    the knuckles of a fist. Without Gaussians on faces nothing changes.
     """
     rest, faces, vertex_faces, rim = on
     n = len(rest)
     if prediction.colors.shape[1] == n:
         return prediction
-    colors, on_faces = prediction.colors.split([n, prediction.colors.shape[1] - n], 1)
+    on_faces = prediction.colors[:, n:]
     count = (vertex_faces < on_faces.shape[1]).sum(1)[:, None].clamp_min(1)
     around = surface.gather_to_vertices(on_faces, vertex_faces) / count
-    anchors = batch_anchors(rest[None], faces, vertex_faces, rim)
-    quats, scales, fade = (part[:, :n] for part in anchors)
-    own, least = prediction.opacities[:, :n], COVERING_OPACITY * fade
-    share = (own / least.clamp_min(MIN_OPACITY)).clamp(max=1)[..., None]
-    sunk = -GROUND_DEPTH * surface.gathered_normals(rest, faces, vertex_faces)
-    same = torch.where((quats * prediction.quats[:, :n]).sum(-1, keepdim=True) < 0, -quats, quats)
-
-    def replaced(disc: Tensor, every: Tensor) -> Tensor:
-        return torch.cat([torch.lerp(disc, every[:, :n], share), every[:, n:]], 1)
-
+    quats, scales, fade = (part[:, :n] for part in batch_anchors(rest[None], faces, vertex_faces, rim))
     return prediction._replace(
-        offsets=torch.lerp(sunk.expand_as(prediction.offsets), prediction.offsets, share),
-        quats=normalize(replaced(same, prediction.quats), dim=-1),
-        scales=replaced(scales, prediction.scales),
-        colors=torch.cat([torch.lerp(around, colors, share), on_faces], 1),
-        opacities=torch.cat([torch.maximum(own, least), prediction.opacities[:, n:]], 1),
+        offsets=-GROUND_DEPTH * surface.gathered_normals(rest, faces, vertex_faces).expand_as(prediction.offsets),
+        quats=torch.cat([quats, prediction.quats[:, n:]], 1),
+        scales=torch.cat([DISC_SPREAD * scales, prediction.scales[:, n:]], 1),
+        colors=torch.cat([around, on_faces], 1),
+        opacities=torch.cat([OPACITY * fade, prediction.opacities[:, n:]], 1),
     )
 
 
