@@ -224,10 +224,10 @@ def panels(photo: Photo) -> list[np.ndarray]:
     marked = cv2.drawContours(said.image.copy(), outline, -1, (255, 0, 0), 1)
     confidence = np.clip((-3 - np.log(said.spread)) / 4, 0, 1)[..., None].repeat(3, 2)
     albedo = said.albedo.transpose(1, 2, 0)
-    shading = (said.image / 255.0) ** GAMMA / np.maximum(albedo, DARKEST)
+    shading = (said.image / 255.0) ** GAMMA / np.maximum(albedo**GAMMA, DARKEST)
     fields = (
         said.shares[1:].transpose(1, 2, 0), (0.5 + 5 * said.surface.transpose(1, 2, 0)) * on_hand, confidence * on_hand,
-        (0.5 + 0.5 * said.normal.transpose(1, 2, 0)) * on_hand, albedo ** (1 / GAMMA) * on_hand,
+        (0.5 + 0.5 * said.normal.transpose(1, 2, 0)) * on_hand, albedo * on_hand,
         (shading / 2) ** (1 / GAMMA) * on_hand,
     )  # fmt: skip
     return [marked, *((255 * field.clip(0, 1)).astype(np.uint8) for field in fields)]

@@ -107,7 +107,7 @@ def right(hand):
     photo = Photo(torch.stack([x, y % 256, x * 0], -1).to(torch.uint8), None, None, "places.png", 1.0)
     shape = torch.zeros(len(hand.shape_names))
     places = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(0))
-    reading = SurfaceReading(places, places[..., 0], low[0] - 7.3, low[1] - 4.8, 0.8 * (high[1] - low[1]))
+    reading = SurfaceReading(places, places[..., 0], places, low[0] - 7.3, low[1] - 4.8, 0.8 * (high[1] - low[1]))
     landmarks = Landmarks(xy, None, "right", 1.0, 1.0, "file")
     return photo, HandFit("right", shape, pose, camera, landmarks, mask, 0, 0, 1, 0, (), reading)
 
@@ -144,7 +144,7 @@ def test_a_pixel_of_the_crop_has_the_place_that_was_read_there(hand, right):
     column, row = ((at - torch.tensor([there.left, there.top])) / there.side * 32).floor().long().tolist()
     assert 0 <= row < 32 and 0 <= column < 32
     assert torch.equal(crop.reading[30, 40, :3], there.places[row, column])
-    assert crop.reading.shape == (size, size, 4) and bool(crop.reading[-1, -1, 3].isinf())  # beyond what was read
+    assert crop.reading.shape == (size, size, 7) and bool(crop.reading[-1, -1, 3].isinf())  # beyond what was read
 
 
 @pytest.mark.parametrize("side", ["left", "right"])

@@ -98,7 +98,7 @@ def _behind_outline(hand: HandModel, seen: DepthMap) -> Bool[Tensor, "S S"]:
 
 
 def _other_places(
-    hand: HandModel, seen: DepthMap, reading: Float[Tensor, "S S 4"] | None
+    hand: HandModel, seen: DepthMap, reading: Float[Tensor, "S S 7"] | None
 ) -> Float[Tensor, "S S"] | float:
     """How likely a pixel shows another place than the fitted surface there, by the network's reading, 0 to 1.
 

@@ -1,7 +1,5 @@
 """Paint what no photo shows: a plausible skin in the person's tone, joined to the seen skin without a seam."""
 
-import functools
-import math
 from typing import NamedTuple
 
 import torch
@@ -13,31 +11,15 @@ from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.adaptation.reliability import VertexObservations
 from oasis_warp.adaptation.sharpen import FADE_REACH
 from oasis_warp.adaptation.skin_detail import Places, SkinDetail, flush_shade, relief_shade, sample_detail
+from oasis_warp.adaptation.skin_tone import MIN_COLOR, SkinTone, infer_tone
 from oasis_warp.avatar.anchors import RIM_FADE, vertex_colors, vertex_to_gaussians
-from oasis_warp.avatar.appearance import Regions, label_regions, skin_color
+from oasis_warp.avatar.appearance import label_regions
 from oasis_warp.avatar.densify import densify, part_centers
 from oasis_warp.avatar.observation import observe
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import TIP_JOINTS, HandModel
 from oasis_warp.core.types import CanonicalGaussians, HandCrop
-from oasis_warp.hand.template import bundled_hand
 
-LIGHTEST, DARKEST, TONES = 0.006, 0.35, 25
-"""Range and number of the tones tried, evenly spaced in the logarithm of the melanin share."""
-SIGMA_COLOR = 0.05
-"""Expected difference of a person's skin from the mean of that region and tone, as a logarithm."""
-SIGMA_EXPOSURE, SIGMA_CAST = 0.18, 0.155
-"""Expected logarithms of the photo's brightness over that of an evenly lit hand, and of its red and blue over its green
-over theirs, as in `avatar.prior`."""
-BLOOD = 0.0125
-"""Share of blood in the skin of a back."""
-PALM_BLOOD, TIP_BLOOD, KNUCKLE_BLOOD = 1.1, 0.7, 1.1
-"""How much more of it palms, finger tips and knuckles have. With it palm minus back in CIELAB's a* is +2 to +6, as on
-real hands."""
-KNUCKLE_MELANIN = 0.15
-"""How much more melanin knuckles have."""
-MIN_COLOURFUL = 0.4
-"""Least saturation of a photo over that of skin in even light: less is taken for a cast of grey light."""
 SEEN = 0.5
 """Confidence of an observation from which skin is left as the photo shows it."""
 RIM_PASSES = 3
@@ -80,92 +62,6 @@ GLOSS, GLOSS_AT, GLOSS_WIDTH = 0.18, 0.15, 0.2
 this sine, and the stripe's width."""
 KNOWN_NAIL = 0.05
 """Share of all nails that must be seen to count as much as the mean person's."""
-MIN_COLOR = 0.01
-"""Least colour whose logarithm is taken."""
-
-
-class SkinTone(NamedTuple):
-    """Mean colours of a person in the light of the photo."""
-
-    log_skin: Float[Tensor, "V 3"]
-    """Logarithms of the sRGB colours of skin at the vertices; under nails too."""
-    log_nail: Float[Tensor, "3"]
-    """Log colour of a nail's bed, seen through its plate."""
-    melanin: float
-    """Share on the back."""
-
-
-def infer_tone(
-    hand: HandModel, guess: Float[Tensor, "V 3"], seen: Float[Tensor, "V 3"], weight: Float[Tensor, "V"]
-) -> SkinTone:
-    """Mean colours of all regions, for the tone of the guess, as the photo shows them.
-
-    For every tone the gain of each channel is the mean of the logarithms' differences to the guess. The remaining
-    brightness and cast of the gain are weighed by their expected sizes; the tone is the posterior mean of log melanin.
-    The guess of a learned prior knows the tone better than the photo's own colours: light skin in dim light and dark
-    skin in bright light look alike. In a photo that is less colourful than skin, all differences of regions are less
-    colourful, too.
-
-    Args:
-        hand: The model.
-        guess: sRGB colours of the prior at the vertices, before they were calibrated.
-        seen: Those fitted to the photo, in even light.
-        weight: How far to trust these.
-    """
-    table, nails = (part.to(seen) for part in _tone_table())
-    bare = 1 - label_regions(hand).nail.to(seen)
-    tones = torch.linspace(math.log(LIGHTEST), math.log(DARKEST), TONES).to(seen)
-    log_melanin = _log_melanin(table, tones, guess.clamp_min(MIN_COLOR).log(), bare / bare.sum())
-    place = ((log_melanin - tones[0]) / (tones[1] - tones[0])).clamp(0, TONES - 1)
-    low = place.long().clamp_max(TONES - 2)
-    skin, nail = (torch.lerp(part[low], part[low + 1], place - low) for part in (table, nails))
-    share = weight * bare / (weight * bare).sum().clamp_min(1e-9)
-    shown, mean = ((share[:, None] * logs).sum(0) for logs in (seen.clamp_min(MIN_COLOR).log(), skin))
-    colour = mean - mean.mean()
-    colourful = ((shown - shown.mean()) @ colour / colour.square().sum()).clamp(MIN_COLOURFUL, 1)
-
-    def in_photo_colors(logs: Tensor) -> Tensor:
-        """Its difference from the mean, less colourful, on what the photo shows."""
-        beyond = logs - mean
-        grey = beyond.mean(-1, keepdim=True)
-        return shown + grey + colourful * (beyond - grey)
-
-    return SkinTone(in_photo_colors(skin), in_photo_colors(nail), float(log_melanin.exp()))
-
-
-def _log_melanin(
-    table: Float[Tensor, "T V 3"], tones: Float[Tensor, "T"], logs: Float[Tensor, "V 3"], share: Float[Tensor, "V"]
-) -> Tensor:
-    """Posterior mean over the tones that explain the logarithms of colours."""
-    difference = logs - table
-    gain = (share[:, None] * difference).sum(1)
-    left = (share[:, None] * (difference - gain[:, None]).square()).sum(1).mean(1)
-    cast = gain[:, 0::2] - gain[:, 1:2]
-    cost = left / SIGMA_COLOR**2 + (gain.mean(1) / SIGMA_EXPOSURE).square() + (cast / SIGMA_CAST).square().sum(1)
-    return torch.softmax(-cost / 2, 0) @ tones
-
-
-@functools.cache
-def _tone_table() -> tuple[Float[Tensor, "T V 3"], Float[Tensor, "T 3"]]:
-    """Logarithms of skin colours at the vertices and of a nail, for every tone."""
-    regions = label_regions(bundled_hand())
-    tones = torch.linspace(math.log(LIGHTEST), math.log(DARKEST), TONES).exp().tolist()
-    pairs = [tone_colors(regions, tone) for tone in tones]
-    return torch.stack([skin for skin, _ in pairs]).log(), torch.stack([nail for _, nail in pairs]).log()
-
-
-def tone_colors(regions: Regions, melanin: float) -> tuple[Float[Tensor, "V 3"], Float[Tensor, "3"]]:
-    """Evenly lit sRGB colours of smooth skin and of nails of a hand whose back has this `melanin` share.
-
-    A palm holds about a third of the melanin of the back, but a light palm holds no less than the back.
-    """
-    palm, tip, knuckle = regions.palm, regions.finger_tip, regions.knuckle
-    palm_melanin = min(0.6 * melanin, 0.006 + 0.33 * melanin)
-    amount = ((1 - palm) * math.log(1.15 * melanin) + palm * math.log(palm_melanin)).exp()
-    amount = amount * (1 + KNUCKLE_MELANIN * knuckle)
-    blood = BLOOD * (1 + PALM_BLOOD * palm + TIP_BLOOD * tip * (0.4 + 0.6 * palm) + KNUCKLE_BLOOD * knuckle)
-    bed = skin_color(amount.new_tensor([0.5 * melanin]), amount.new_tensor([1.9 * BLOOD]))[0]
-    return skin_color(amount, blood), 0.86 * bed + 0.14
 
 
 class PaintedSkin(NamedTuple):
@@ -210,7 +106,7 @@ def paint_unseen(
     confidence = observations.confidence.amax(0)
     invented = _unseen_share(hand, confidence)
     seen = vertex_colors(gaussians, len(rest))
-    tone = infer_tone(hand, vertex_colors(guess, len(rest)), seen, confidence)
+    tone = infer_tone(hand, vertex_colors(guess, len(rest)), seen, confidence, crop.reading)
     difference = seen.clamp_min(MIN_COLOR).log() - tone.log_skin
     regions = label_regions(hand)
     nail, palm = regions.nail.to(rest), regions.palm.to(rest)

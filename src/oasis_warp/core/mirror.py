@@ -74,7 +74,8 @@ def mirror_landmarks(landmarks: Landmarks, width: int) -> Landmarks:
 def mirror_reading(reading: SurfaceReading, width: int) -> SurfaceReading:
     """The reading of the mirror image of a photo of `width` pixels; places stay, which are on the right hand."""
     left = width - reading.left - reading.side
-    return SurfaceReading(reading.places.flip(1), reading.spread.flip(1), left, reading.top, reading.side)
+    planes = (plane.flip(1) for plane in (reading.places, reading.spread, reading.albedo))
+    return SurfaceReading(*planes, left, reading.top, reading.side)
 
 
 def as_right_hand(fit: HandFit) -> HandFit:

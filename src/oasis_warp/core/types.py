@@ -76,12 +76,14 @@ class PosedHand(NamedTuple):
 
 
 class SurfaceReading(NamedTuple):
-    """The place on the hand that each pixel shows, as a network reads the photo; a square of R x R samples."""
+    """Place and colour of the skin that each pixel shows, as a network reads the photo; a square of R x R samples."""
 
     places: Float[Tensor, "R R 3"]
     """On the bundled hand at rest [m]."""
     spread: Float[Tensor, "R R"]
     """Scale of their error [m]; infinite where the network sees no hand."""
+    albedo: Float[Tensor, "R R 3"]
+    """sRGB colour of the skin in even white light."""
     left: float
     top: float
     side: float
@@ -129,8 +131,8 @@ class HandCrop(NamedTuple):
     """The fitted surface at rest."""
     posed: PosedHand
     """The fitted surface in the photo's pose, in the world of `camera`."""
-    reading: Float[Tensor, "S S 4"] | None = None
-    """Places and spread of `SurfaceReading` at the crop's pixels."""
+    reading: Float[Tensor, "S S 7"] | None = None
+    """Places, spread and albedo of `SurfaceReading` at the crop's pixels."""
 
 
 class Gaussians(NamedTuple):

@@ -148,9 +148,9 @@ def crop_hand(
 
 def _resampled_reading(
     reading: SurfaceReading, left: float, top: float, side: float, size: int
-) -> Float[Tensor, "S S 4"]:
+) -> Float[Tensor, "S S 7"]:
     """`HandCrop.reading`, by the nearest sample: the mean of the places on two fingers is no place."""
-    planes = torch.cat([reading.places, reading.spread[..., None]], -1)
+    planes = torch.cat([reading.places, reading.spread[..., None], reading.albedo], -1)
     steps = (torch.arange(size, dtype=torch.float64) + 0.5) / size * side
     starts = top - reading.top, left - reading.left
     near = [((start + steps) / reading.side * len(planes)).floor().long() for start in starts]

@@ -47,7 +47,7 @@ class PixelReading:
     normal: np.ndarray
     """Unit normal in the camera's frame, [3, S, S]."""
     albedo: np.ndarray
-    """Diffuse reflectance, linear RGB, [3, S, S]."""
+    """sRGB colour of the skin in even white light, [3, S, S]."""
     finger: np.ndarray
     """Probabilities of palm and back, thumb, index, middle, ring and little finger, [6, S, S]."""
 
@@ -113,7 +113,7 @@ def read_pixels(rgb: np.ndarray, xy: np.ndarray, network: DenseNetwork | None = 
             SURFACE_UNIT * out.surface[0].cpu().numpy(),
             SURFACE_UNIT * out.log_scale[0].exp().cpu().numpy(),
             out.normal[0].cpu().numpy(),
-            _linear(out.albedo[0].cpu().numpy()),
+            out.albedo[0].cpu().numpy(),
             out.finger[0].softmax(0).cpu().numpy(),
         )
 
@@ -128,10 +128,6 @@ def _crop(rgb: np.ndarray, corner: np.ndarray, scale: float) -> np.ndarray:
     x, y = corner + 0.5 / scale - 0.5
     to_photo = np.array([[1 / scale, 0, x], [0, 1 / scale, y]])
     return cv2.warpAffine(rgb, to_photo, (SIDE, SIDE), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-
-
-def _linear(srgb: np.ndarray) -> np.ndarray:
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 _HAND = 0.6
@@ -179,7 +175,7 @@ def surface_reading(reading: PixelReading, view: MirroredInput) -> SurfaceReadin
     """What the network reads in `view`, in the photo's own frame."""
     spread = np.where(reading.hand > _HAND, reading.spread, np.inf)
     x, y = reading.corner / view.scale
-    places = torch.from_numpy(reading.surface).permute(1, 2, 0)
+    places, albedo = (torch.from_numpy(planes).permute(1, 2, 0) for planes in (reading.surface, reading.albedo))
     side = SIDE / reading.scale / float(view.scale[0])
-    found = SurfaceReading(places, torch.from_numpy(spread), float(x), float(y), side)
+    found = SurfaceReading(places, torch.from_numpy(spread), albedo, float(x), float(y), side)
     return mirror_reading(found, view.photo_size[0]) if view.mirrored else found

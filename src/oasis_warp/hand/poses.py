@@ -32,7 +32,7 @@ Thumb = tuple[float, float, float, float, float]
 """Flexion, abduction and twist of the thumb's base, flexion of its two outer joints [degrees]."""
 
 _FIST: dict[str, Finger] = {
-    "index": (78, 110, 58, -4),
+    "index": (82, 110, 52, -3),
     "middle": (86, 110, 59, -2),
     "ring": (79, 110, 62, 4),
     "little": (70, 106, 62, 6),
@@ -44,7 +44,7 @@ _FIST: dict[str, Finger] = {
 _THUMBS: dict[str, Thumb] = {
     "open": (-10, 14, 0, 0, 0),
     "relaxed": (8, -4, 0, 14, 16),
-    "fist": (30, 14, -14, 42, 70),
+    "fist": (28, 15, -14, 42, 68),
     "pinch": (35, 10, -10, 2, 5),
     "thumbs_up": (-14, 16, 0, 3, -10),
     "victory": (43, 15, -18, 37, 44),
