@@ -74,7 +74,7 @@ def test_a_stiff_hand_sees_the_same_share_however_it_turns(hand, scene):
     before, after = (seen(hand, crop, posed) for posed in (crop.posed.vertices, crop.posed.vertices @ turn.T))
     off = (before - after).abs()
     assert float(off.quantile(0.99)) < 5e-4  # a step of rounding in a depth buffer, where hardly any light arrives
-    assert float(off.max()) < 0.01  # beside an edge, rounding hides a vertex of the coarse mesh from one direction
+    assert float(off.max()) < 0.05  # beside an edge, rounding hides a vertex of the coarse mesh from one direction
 
 
 def test_shade_goes_when_what_cast_it_has_moved(hand, scene):

@@ -33,11 +33,13 @@ from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandFit
 from oasis_warp.estimation.fit_problem import mirrored_fit
 from oasis_warp.estimation.landmarks import box_size
 from oasis_warp.estimation.outline import WRIST_LINE, is_grazing, window, wrist_line
+from oasis_warp.hand.contact import flesh_thickness
 from oasis_warp.hand.kinematics import HandKinematics, unit
 from oasis_warp.render import render
 
-LONGEST = 0.006
-"""Largest displacement of a vertex by outlines of the mesh [m]."""
+LONGEST, OF_FINGER = 0.006, 0.3
+"""Largest displacement of a vertex by outlines of the mesh [m], and over its distance from its finger's bone. Where two
+fingers cross, a fit that is a little off would make a bulb of the tip behind."""
 BEYOND = 0.5
 """Distance of the outline of Gaussians, at half opacity, outside the mask's [px]. A pixel on the outline is half
 background in the photo and half black in an image over black, so what fits best is opaque there: see docs/avatar.md."""
@@ -77,12 +79,13 @@ def outline_offsets(hand: HandModel, *fits: HandFit) -> Float[Tensor, "V 3"]:
     views = [_View(hand, fit) for fit in fits]
     sheet = ThinSheet(views[0].kinematics.faces, len(views[0].kinematics.template))
     offsets = np.zeros_like(views[0].rest)
+    longest = np.minimum(LONGEST, OF_FINGER * flesh_thickness(hand))[:, None]
     for _ in range(_ROUNDS):
         vertices, target, weight = _joined([view.observe(offsets) for view in views])
         if len(vertices) == 0:
             break
         offsets = sheet.solve(vertices, target, weight)
-        offsets *= np.minimum(1, LONGEST / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12))
+        offsets *= np.minimum(1, longest / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12))
     return torch.from_numpy(offsets.astype(np.float32))
 
 

@@ -90,7 +90,7 @@ def contact_tables(device: torch.device) -> ContactTables:
         "samples": face[members[starts[:-1, None] + np.diff(starts)[:, None] * np.arange(SAMPLES) // SAMPLES]],
         "beside": _beside(part[near.row], part[near.col], n_parts),
         "allowed": _may_touch(hand, part, edges),
-        "give": np.minimum(LIMIT, YIELD * _thickness(hand)) * (1 - rigid).clip(0),
+        "give": np.minimum(LIMIT, YIELD * flesh_thickness(hand)) * (1 - rigid).clip(0),
         "offsets": around.indptr,
         "neighbours": around.indices,
         "weights": around.data,
@@ -148,7 +148,7 @@ def _may_touch(hand: HandModel, part: np.ndarray, edges: np.ndarray) -> np.ndarr
     return np.packbits(filled, axis=1, bitorder="little").view("<i4")
 
 
-def _thickness(hand: HandModel) -> np.ndarray:
+def flesh_thickness(hand: HandModel) -> np.ndarray:
     """Distance of each vertex at rest from the axis of its finger's bone [m]; infinite on the palm."""
     joints, tips, points = (part.double().numpy() for part in (hand.joints, hand.tips, hand.template))
     found = np.full(len(points), np.inf)

@@ -164,7 +164,7 @@ class NetworkPrior:
     def with_heads(self, crop: HandCrop) -> tuple[CanonicalGaussians, ColorHeads]:
         """The same guess, and the heads of its colours with their inputs, which LoRA trains.
 
-        Faint Gaussians stay as they are: their heads would say other colours than `cover_surface`.
+        Those of vertices stay as they are: their heads would say other colours than `cover_surface`.
         """
         network, inputs = self.network.to(crop.image.device), batch_of_crop(crop)
         described = network.describe(inputs)
