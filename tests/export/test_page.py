@@ -231,7 +231,7 @@ def test_the_pages_script_poses_a_hand_of_mano_with_all_of_its_correctives(mano,
     expected = avatar_of(rounded, truth, pose, crop.camera)  # rounding moves vertices by some .1 mm
     means = np.fromfile(tmp_path / "means0", "<f4").reshape(-1, 3)
     apart = np.abs(means - expected.pose(in_pose(avatar, "fist")).means.numpy())
-    assert np.quantile(apart, 0.999) < 1e-5 and apart.max() < 5e-5  # contact decides by distances, which are rounded
+    assert np.quantile(apart, 0.999) < 3e-5 and apart.max() < 3e-4  # contact of a fist decides by rounded distances
 
 
 @pytest.mark.slow
