@@ -11,7 +11,15 @@ from oasis_warp.core import surface
 from oasis_warp.estimation.fit_problem import mirrored_fit
 from oasis_warp.estimation.fit_quality import iou_above_wrist
 from oasis_warp.estimation.outline import silhouette
-from oasis_warp.estimation.surface_offsets import BEYOND, LONGEST, crossing, outline_offsets, rendered_outline_offsets
+from oasis_warp.estimation.surface_offsets import (
+    BEYOND,
+    LONGEST,
+    OF_FINGER,
+    crossing,
+    outline_offsets,
+    rendered_outline_offsets,
+)
+from oasis_warp.hand.contact import flesh_thickness
 from oasis_warp.render import render
 
 RIGHT, LEFT = "victory_right_09.jpg", "ok_sign_left_10.jpg"
@@ -51,10 +59,12 @@ def test_the_outline_comes_to_lie_on_the_masks(kinematics, fitted, offsets, name
 
 
 @pytest.mark.parametrize("name", [RIGHT, LEFT])
-def test_displacements_are_small_and_smooth(kinematics, fitted, offsets, name):
+def test_displacements_are_small_and_smooth(hand, kinematics, fitted, offsets, name):
     shift = offsets(name).numpy().astype(float)
     assert shift.shape == kinematics.template.shape
-    assert np.linalg.norm(shift, axis=1).max() <= LONGEST + 1e-6
+    length = np.linalg.norm(shift, axis=1)
+    assert length.max() <= LONGEST + 1e-6
+    assert (length <= OF_FINGER * flesh_thickness(hand) + 1e-6).all()  # infinite on the palm
     a, b, c = kinematics.faces.T
     step = np.linalg.norm(np.concatenate([shift[a] - shift[b], shift[b] - shift[c]]), axis=1)
     _, rest, _ = posed(kinematics, fitted(name)[2], 0.0)

@@ -10,16 +10,12 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from oasis_warp.avatar.appearance import Regions, label_regions, skin_color
+from oasis_warp.avatar.prior import DARKEST, LIGHTEST, SIGMA_CAST, SIGMA_EXPOSURE, TONES
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.hand.template import bundled_hand
 
-LIGHTEST, DARKEST, TONES = 0.006, 0.35, 25
-"""Range and number of the tones tried, evenly spaced in the logarithm of the melanin share."""
 SIGMA_COLOR = 0.05
 """Expected difference of a person's skin from the mean of that region and tone, as a logarithm."""
-SIGMA_EXPOSURE, SIGMA_CAST = 0.18, 0.155
-"""Expected logarithms of the photo's brightness over that of an evenly lit hand, and of its red and blue over its green
-over theirs, as in `avatar.prior`."""
 BLOOD = 0.0125
 """Share of blood in the skin of a back."""
 PALM_BLOOD, TIP_BLOOD, KNUCKLE_BLOOD = 1.1, 0.7, 1.1
