@@ -104,11 +104,8 @@ class FingerContact:
 
     def _places(self, joints: PosedJoints, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Vertices and normals, nearly unit; without pose correctives."""
-        kinematics = self.kinematics
-        frames = kinematics.blended(joints, index)
-        rest = kinematics.template[index] + kinematics.shape_basis[index] @ joints.shape
-        points = (frames @ rest[..., None])[..., 0] + kinematics.weights[index] @ kinematics.bone_shifts(joints)
-        return points, (frames @ kinematics.rest_normals[index][..., None])[..., 0]
+        normals = self.kinematics.blended(joints, index) @ self.kinematics.rest_normals[index][..., None]
+        return self.kinematics.places(joints, index), normals[..., 0]
 
     def _slopes(self, joints: PosedJoints, gaps: list[Gap]) -> np.ndarray:
         """Derivatives of the gaps by (angles, shape), [C, A + S]."""

@@ -69,8 +69,12 @@ class FitSettings:
     """Sigmas of landmarks and of bone directions where pixels are read, too."""
 
 
-_GESTURES, _GESTURE_STEPS = 8, 4
+_GESTURES, _GESTURE_STEPS = 6, 4
 """Gestures from which the fit to pixels goes on, those nearest to the fit before, and the steps that compare them."""
+_SEARCHES, _WHOLE = 2, 0.03
+"""Largest number of searches of the fingers' gestures, and weight there of the whole hand's pixels in each gesture,
+beside those of the finger: they decide where a finger has none. Chosen on 150 synthetic photos of a world of their
+own, on which an error of PA-MPJPE of 12.6 mm at 90 % became 8.2."""
 _FIXED = 1e-4
 """Sigma of a shape coefficient that is fixed at its prior."""
 
@@ -129,6 +133,9 @@ class Fitter:
         self.relaxed = np.where(finger_flexion, np.array(s.relaxed)[(joint - 1) % 3], 0.0)
         self.gestures = gesture_prior(kinematics, s.gesture)
         self.contact = FingerContact(kinematics)
+        self.finger_of_vertex, self.finger_of_angle = (
+            (bone + 2) // 3 for bone in (kinematics.hand.segment.cpu().numpy(), joint)
+        )  # 0 is the palm
         self.low, self.high = kinematics.limits[joint, axis].T
         n_shape = kinematics.shape_basis.shape[2]
         if shape is None:
@@ -207,7 +214,7 @@ class Fitter:
         """Pixels against the projections of their places on the surface, and their normals against those there."""
         s, count = self.settings, len(surface.vertex)
         places = state.linearize(*self.kinematics.vertices(joints, surface.vertex, surface.displacement))
-        sigma = np.hypot(s.surface * self.target.box, s.surface_spread * surface.spread)
+        sigma = self._sigmas(surface)
         error = (places.image - surface.xy) / sigma[:, None]
         weight, loss = cauchy((error**2).sum(1), s.surface_scale)
         share = s.surface_weight / count
@@ -224,6 +231,10 @@ class Fitter:
         slope[:, :, 6 : 6 + self.n_angles] = state.rotation @ by_angle
         terms.append((error * weight, slope * (weight / s.normal)[..., None], float(loss.sum() * share)))
         return terms
+
+    def _sigmas(self, surface: SurfacePoints) -> np.ndarray:
+        """Of each pixel's place [px], [P]."""
+        return np.hypot(self.settings.surface * self.target.box, self.settings.surface_spread * surface.spread)
 
     def _priors(self, state: FitState, n: int, gesture: int | None) -> list[tuple[np.ndarray, np.ndarray]]:
         s, eye = self.settings, np.eye(n)
@@ -268,12 +279,38 @@ class Fitter:
     def fit_surface(self, state: FitState, surface: SurfacePoints) -> Solution:
         """Fit to what pixels show of the surface, beside landmarks of little weight; in the gesture that fits best."""
         state = self.solve(state, 8, self.everything, tolerance=1e-3, surface=self._corrected(surface, state)).state
+        for _ in range(_SEARCHES):
+            corrected = self._corrected(surface, state)
+            start = self._fingers_by_pixels(state, corrected)
+            other = self.solve(start, 8, self.everything, tolerance=1e-3, surface=corrected)
+            if other.cost >= self.system(state, surface=corrected)[2]:
+                break
+            state = other.state
         terms, nearest = {"surface": self._corrected(surface, state)}, self.gestures.scores(state.angles)
         tried = [
             self.solve(state, _GESTURE_STEPS, self.everything, tolerance=1e-3, gesture=int(k), **terms)
             for k in nearest.argsort(kind="stable")[:_GESTURES]
         ]
         return min(tried, key=lambda solution: solution.cost)
+
+    def _fingers_by_pixels(self, state: FitState, surface: SurfacePoints) -> FitState:
+        """`state` with each finger bent as in the gesture in which its own pixels fit best.
+
+        Steps do not lead from a finger that the landmarks have straight to a folded one: robust residuals that are
+        large have no slope.
+        """
+        if not len(surface.vertex):
+            return state
+        s, means = self.settings, self.gestures.means
+        finger, sigma = self.finger_of_vertex[surface.vertex], self._sigmas(surface)[:, None]
+        losses = np.zeros((len(means), 6))
+        for own, angles in zip(losses, means, strict=True):
+            joints = self.kinematics.pose_joints(angles, state.shape)
+            places = self.kinematics.places(joints, surface.vertex, surface.displacement)
+            error = (state.project(places) - surface.xy) / sigma
+            own += np.bincount(finger, cauchy((error**2).sum(1), s.surface_scale)[1], len(own))
+        chosen = (losses + _WHOLE * losses.sum(1, keepdims=True)).argmin(0)
+        return replace(state, angles=means[chosen[self.finger_of_angle], np.arange(self.n_angles)])
 
     def refine(
         self, state: FitState, match: Callable[[FitState], OutlinePairs], rounds: int,

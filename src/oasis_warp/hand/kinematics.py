@@ -168,10 +168,15 @@ class HandKinematics:
         """Unit area-weighted normals of the vertices, [V, 3]."""
         return surface.vertex_normals(torch.from_numpy(vertices), self.hand.faces).numpy()
 
+    def places(self, joints: PosedJoints, index: np.ndarray, displacement: np.ndarray | float = 0.0) -> np.ndarray:
+        """Posed vertices `index` [m], [P, 3], after a `displacement` at rest."""
+        rest = self.template[index] + self.shape_basis[index] @ joints.shape + displacement
+        return (self.blended(joints, index) @ rest[..., None])[..., 0] + self.weights[index] @ self.bone_shifts(joints)
+
     def vertices(
         self, joints: PosedJoints, index: np.ndarray, displacement: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Posed vertices `index`, and d vertices / d (angles, shape); their `displacement` [P, 3] stays constant."""
+        """`places` and d places / d (angles, shape); the `displacement` [P, 3] stays constant."""
         basis = self.shape_basis[index]
         start, weights = self.template[index] + basis @ joints.shape + displacement, self.weights[index]
         shifts, frame = self.bone_shifts(joints), self.blended(joints, index)
