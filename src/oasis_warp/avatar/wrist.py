@@ -33,6 +33,8 @@ CAP_HEIGHT = 0.008
 """Height of the cap over the rim [m]: as much as pictures of a hand leave around it."""
 CAP_RINGS = 20
 """Steps of the cap's rings from the rim to its middle: 1.5 mm, closer than the skin's vertices."""
+FIRST_RING = 4
+"""The first of these rings, 1.5 mm inside the rim: those before it stood out beside the arm."""
 MIRRORED = 0.05
 """The stretch of skin before the rim whose detail the end of the wrist repeats in the mirror [m]."""
 AVERAGED = 100
@@ -50,6 +52,9 @@ ARM_GROWTH = 0.2
 """How much wider the arm is at its end than at the rim."""
 BEFORE_RIM, ASIDE = 0.008, 0.004
 """Stretch of skin before the rim whose direction the arm follows, and width along the rim of what is averaged [m]."""
+STRAIGHT = 0.008
+"""Length past the rim over which the arm keeps the direction of the skin before it [m]; without, outlines had a step
+there."""
 ARM_STEP, COARSER = 0.001, 3.0
 """Distance of the arm's Gaussians at the rim [m], half of that of the skin's vertices, and how much larger it is at the
 end: with 2 mm the skin's detail ended at the rim."""
@@ -209,7 +214,14 @@ def arm_axis(rest: Float[Tensor, "V 3"], rim: Int[Tensor, "R"]) -> Float[Tensor,
     They differ by 17 degrees. Along the normal the arm turned back from the palm, with a step at the rim; along the
     skin, which is flared, it stepped on the back.
     """
-    axis, at = rim_axis(rest, rim), rest - rest[rim].mean(0)
+    axis = rim_axis(rest, rim)
+    lean, outward = _lean(rest, rim, axis)
+    return normalize(axis + (lean * outward).mean(0), dim=0)
+
+
+def _lean(rest: Tensor, rim: Tensor, axis: Tensor) -> tuple[Float[Tensor, "R 1"], Float[Tensor, "R 3"]]:
+    """How far the skin before each point of the rim leads outward per length of `axis`, and unit vectors outward."""
+    at = rest - rest[rim].mean(0)
     along = at @ axis
     arms = at - along[:, None] * axis
     radii, outward = arms.norm(dim=1), normalize(arms, dim=1)
@@ -218,7 +230,7 @@ def arm_axis(rest: Float[Tensor, "V 3"], rim: Int[Tensor, "R"]) -> Float[Tensor,
     share = torch.softmax(-0.5 * (apart / ASIDE).square(), 1)
     run, rise = along[before] - along[rim][:, None], radii[before] - radii[rim][:, None]
     lean = (share * run * rise).sum(1) / (share * run.square()).sum(1)
-    return normalize(axis + (lean[:, None] * outward[rim]).mean(0), dim=0)
+    return lean[:, None], outward[rim]
 
 
 def rim_line(
@@ -246,7 +258,7 @@ def rim_cap(
     step = float(math.pi / 2 / CAP_RINGS)
     length = step * math.hypot(float(arms.norm(dim=1).mean()), CAP_HEIGHT) / math.sqrt(2)  # of a step, in the mean
     index, offsets, normals, tangents = [], [], [], []
-    for k in range(1, CAP_RINGS + 1):
+    for k in range(FIRST_RING, CAP_RINGS + 1):
         share, height = math.cos(step * k), math.sin(step * k)
         rows, arm, out, tangent = _ring(edge, axis, length / share, 0.5 * (k % 2))
         index.append(rows)
@@ -266,6 +278,8 @@ def fading_arm(
     It is filled past the cap: seen along the arm, the cap would be a disc in a hollow.
     """
     edge, axis = rest[rim], arm_axis(rest, rim)
+    lean, across = _lean(rest, rim, axis)
+    slope = lean * across
     radius = float((edge - edge.mean(0)).norm(dim=1).mean())
     n_walls = round(ARM_LENGTH / ARM_STEP * math.log(COARSER) / (COARSER - 1))
     coarser = [COARSER ** (k / n_walls) for k in range(1, n_walls)]
@@ -277,12 +291,14 @@ def fading_arm(
     fill = [(height / ARM_LENGTH, place, FILL_STEP) for height in sections for place in places]
     index, offsets, normals, tangents, scales, opacities = [], [], [], [], [], []
     for k, (share, out, length) in enumerate(walls + fill):
-        rows, arm, outward, tangent = _ring(edge, axis, length / out, 0.5 * (k % 2))
+        rows, arm, outward, tangent, flare = _ring(edge, axis, length / out, 0.5 * (k % 2), slope)
         index.append(rows)
-        wide = out * (1 + ARM_GROWTH * share**2)
-        offsets.append(edge.mean(0) + wide * arm + share * ARM_LENGTH * axis - edge[rows])
-        inside = out < 1
-        normals.append(axis.expand_as(arm) if inside else normalize(outward, dim=-1))
+        height, wide = share * ARM_LENGTH, out * (1 + ARM_GROWTH * share**2)
+        left = math.exp(-height / STRAIGHT)
+        offsets.append(edge.mean(0) + wide * arm + out * STRAIGHT * (1 - left) * flare + height * axis - edge[rows])
+        inside, outward = out < 1, normalize(outward, dim=-1)
+        tilt = left * (flare * outward).sum(1, keepdim=True) * axis
+        normals.append(axis.expand_as(arm) if inside else normalize(outward - tilt, dim=-1))
         tangents.append(tangent)
         flat = _discs(length, arm)
         scales.append(flat[:, :1].expand(-1, 3) if inside else flat)
@@ -293,9 +309,12 @@ def fading_arm(
 
 
 def _ring(
-    edge: Float[Tensor, "R 3"], axis: Float[Tensor, "3"], length: float, shift: float
-) -> tuple[Int[Tensor, "M"], Float[Tensor, "M 3"], Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
-    """Points about `length` apart on the rim: the nearest of its points, arms from its middle, outward, along it."""
+    edge: Float[Tensor, "R 3"], axis: Float[Tensor, "3"], length: float, shift: float, *fields: Float[Tensor, "R 3"]
+) -> tuple[Tensor, ...]:
+    """Points about `length` apart on the rim: the nearest of its points, arms from its middle, outward, along it.
+
+    After these, each [M] or [M, 3], come the `fields` of the rim's points, interpolated.
+    """
     arms, n = edge - edge.mean(0), len(edge)
     along = arms.roll(-1, 0) - arms.roll(1, 0)
     outward = torch.linalg.cross(along, axis.expand_as(along))
@@ -305,9 +324,8 @@ def _ring(
     place = (torch.arange(count, device=edge.device) + shift) * (n / count)
     first, second = place.long() % n, (place.long() + 1) % n
     between = (place - place.floor()).to(arms)[:, None]
-    fields = torch.cat([arms, outward, along], 1)
-    arm, out, tangent = torch.lerp(fields[first], fields[second], between).split(3, 1)
-    return torch.where(between[:, 0] < 0.5, first, second), arm, out, tangent
+    known = torch.cat([arms, outward, along, *fields], 1)
+    return torch.where(between[:, 0] < 0.5, first, second), *torch.lerp(known[first], known[second], between).split(3, 1)
 
 
 def _discs(length: float, rows: Float[Tensor, "M D"]) -> Float[Tensor, "M 3"]:
