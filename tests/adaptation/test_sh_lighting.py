@@ -7,7 +7,7 @@ from synthetic import as_left_hand, avatar_of, crop_of
 from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.adaptation.sh_lighting import (
     ALBEDO_SHARE,
-    MAX_FINE,
+    DARKEST_FINE,
     SKIN_DEVIATION,
     add_shade,
     fit_light,
@@ -406,5 +406,5 @@ def test_ink_on_single_gaussians_is_no_mark(hand, albedo_scene):
     ratio = ((parted.colors / guess.colors).log().norm(dim=1) / (learned.colors / guess.colors).log().norm(dim=1))
     there = clear & (torch.arange(len(clear)) % 2 == n_vertices % 2)
     assert int(there.sum()) > 100
-    fine = (1 - ALBEDO_SHARE) * MAX_FINE * math.sqrt(3) / torch.tensor(INK).log().norm()
+    fine = (1 - ALBEDO_SHARE) * DARKEST_FINE * math.sqrt(3) / torch.tensor(INK).log().norm()
     assert ratio[there].max() < ALBEDO_SHARE + fine + 0.05
