@@ -174,6 +174,21 @@ def test_pixels_that_say_where_they_are_on_the_surface_bring_a_bad_start_to_the_
     assert np.abs(found.angles - truth.angles).mean() < 0.5 * np.abs(start.angles - truth.angles).mean()
 
 
+def test_a_finger_that_landmarks_have_straight_folds_where_its_pixels_say_so(kinematics):
+    """Robust residuals that are large have no slope: it stayed straight, and the hand bent around it."""
+    joint, axis = kinematics.dofs.T
+    straight = posed_hand(kinematics, 2)
+    flexion = (joint >= 4) & (joint <= 12) & (axis == 0)
+    folded = np.radians([80.0, 98.0, 62.0])[(joint - 1) % 3] - kinematics.rest_bend[joint]
+    truth = replace(straight, angles=np.where(flexion, folded, straight.angles))
+    fitter = Fitter(kinematics, seen(kinematics, straight, focal=straight.focal))
+    start = fitter.fit_landmarks().state
+    found = fitter.fit_surface(start, pixels(kinematics, truth, 600)).state
+    off = np.abs(found.angles - truth.angles)[flexion]
+    assert np.abs(start.angles - truth.angles)[flexion].mean() > np.radians(40)
+    assert off.mean() < np.radians(6)
+
+
 def test_no_pixels_leave_the_fit_to_the_landmarks(kinematics):
     fitter = Fitter(kinematics, seen(kinematics, posed_hand(kinematics, 1)))
     state, nothing = fitter.fit_landmarks().state, pixels(kinematics, posed_hand(kinematics, 1), 0)

@@ -325,7 +325,8 @@ def _ring(
     first, second = place.long() % n, (place.long() + 1) % n
     between = (place - place.floor()).to(arms)[:, None]
     known = torch.cat([arms, outward, along, *fields], 1)
-    return torch.where(between[:, 0] < 0.5, first, second), *torch.lerp(known[first], known[second], between).split(3, 1)
+    read = torch.lerp(known[first], known[second], between).split(3, 1)
+    return torch.where(between[:, 0] < 0.5, first, second), *read
 
 
 def _discs(length: float, rows: Float[Tensor, "M D"]) -> Float[Tensor, "M 3"]:
