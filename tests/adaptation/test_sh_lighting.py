@@ -25,7 +25,7 @@ from oasis_warp.avatar.pose import (
     with_photo,
 )
 from oasis_warp.avatar.prior import MeanPrior
-from oasis_warp.avatar.sky import studio_light
+from oasis_warp.avatar.sky import environment_light
 from oasis_warp.core import rotation
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.mirror import mirror_light, mirror_points
@@ -74,13 +74,16 @@ def test_lamps_are_sharper_than_harmonics_of_degree_1(hand, scene):
     """With four harmonics skin was drawn in other poses with three quarters of the contrast that photos have."""
     even, truth, *_ = scene
     there = even.rest.vertices, even.posed.vertices, hand.faces
-    lamps = LIGHT._replace(harmonics=studio_light(), limits=torch.tensor([[0.05], [3.0]]).expand(2, 3))
+    room = torch.full((16, 32, 3), 0.1)
+    room[6, 28] = 40.0  # a lamp beside the camera, above and to the right
+    lamps = LIGHT._replace(harmonics=environment_light(room), limits=torch.tensor([[0.02], [5.0]]).expand(2, 3))
     posed = pose_gaussians(truth, hand.faces, *there[:2], with_photo(lamps, *there))
     drawn = render(posed, even.camera)
     found = fit_light(hand, even.image, even._replace(image=drawn.image + (1 - drawn.alpha)[..., None] * even.image))
     seen = observe(hand, even).confidence > 0.5
-    ratio = (shading(found, posed_lighting(*there, found)) / shading(lamps, posed_lighting(*there, lamps)))[seen]
-    assert float((ratio / ratio.mean(0) - 1).abs().quantile(0.95)) < 0.08
+    received, true = (shading(light, posed_lighting(*there, light))[seen] for light in (found, lamps))
+    error = (received / received.mean(0) - true / true.mean(0)).square().mean().sqrt()
+    assert float(error) < 0.057  # of .064 with degree 1
 
 
 def test_a_guess_of_the_wrong_hue_lights_no_side_in_colour(hand, scene):
