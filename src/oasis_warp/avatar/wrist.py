@@ -250,8 +250,8 @@ def rim_cap(
 ) -> tuple[Int[Tensor, "M"], Float[Tensor, "M 3"], Float[Tensor, "M 4"], Float[Tensor, "M 3"]]:
     """Vertex Gaussians that close the open end: vertices of the rim, offsets, quaternions and scales [m].
 
-    With arms a from the middle of the rim to its points, p = cos(f) a + sin(f) h: half an ellipsoid, which continues
-    the skin without an edge. Points of a ring are as far apart as the rings.
+    With arms a from the middle of the rim to its points, p = cos(f) a + sin(f) h: half an ellipsoid from `FIRST_RING`
+    on. Points of a ring are as far apart as the rings.
     """
     edge, axis = rest[rim], rim_axis(rest, rim)
     arms = edge - edge.mean(0)
