@@ -183,7 +183,7 @@ def test_palm_and_back_show_twice_as_much_as_the_palm(palm, alone):
     made = reconstruct_same_hand([palm, read_photo(BACK)], SMALL)
     first, second = (photo.errors for photo in made.photos)
     assert made.errors["seen_percent"] > 1.7 * first["seen_percent"]
-    assert first["best_percent"] > 12 and second["best_percent"] > 12  # of what each surely shows, without scraps
+    assert first["best_percent"] > 11 and second["best_percent"] > 11  # of what each surely shows, without scraps
     assert made.photos[0].gain == (1.0, 1.0, 1.0)
     assert first["input_psnr_db"] > 22 and second["input_psnr_db"] > 22
     assert torch.equal(made.photos[0].fit.shape, made.photos[1].fit.shape)
