@@ -15,7 +15,7 @@ def test_the_arm_goes_half_way_from_the_rims_normal_to_the_skins_direction(hand)
 
 
 def test_the_arm_leaves_the_rim_as_the_skin_reaches_it(hand):
-    """Straight from the rim on, it made a step of up to 30 degrees in outlines at the wrist."""
+    """Straight from the rim on, it turned by up to 24 degrees, a step in outlines at the wrist."""
     rest, rim = hand.template, hand.rim
     axis, middle = arm_axis(rest, rim), rest[rim].mean(0)
     index, offsets, *_ = fading_arm(rest, rim)

@@ -33,9 +33,8 @@ HARMONICS_COVARIANCE = (
 SECOND_DEGREE = (0.140, 0.084, 0.011, 0.090, 0.034)
 """Covariance of the first four, and variances of the others. Those of degree 2 were measured in 3,000 synthetic rooms.
 The mean and the first four were measured in synthetic rooms, too, made symmetric in x, and the spread of directions was
-doubled: of seven priors this one was chosen on 96 pairs of 32 photos of same_hand. Light of degree 1 as the rooms had
-it drew skin with .76/.70/.64/.62 of the contrast of another photo of the hand, this one with .80/.79/.78/.81, and its
-PSNR is .23 dB higher; the rooms' own statistics, dark behind the hand, lose 1.1 dB."""
+doubled: of seven priors this one was chosen on 96 pairs of 32 photos of same_hand, by contrast and PSNR. With the
+statistics of the rooms, which are dark behind the hand, these pairs lose 1.1 dB of PSNR."""
 HUE_CORRELATION = 0.985
 """Correlation of a harmonic's three channels: rooms have dark and bright sides, but hardly any light is green on one
 side and pink on the other. In 3,000 synthetic rooms it is .99; coloured walls near the hand leave some freedom."""

@@ -53,8 +53,8 @@ ARM_GROWTH = 0.2
 BEFORE_RIM, ASIDE = 0.008, 0.004
 """Stretch of skin before the rim whose direction the arm follows, and width along the rim of what is averaged [m]."""
 STRAIGHT = 0.008
-"""Length past the rim over which the arm keeps the direction of the skin before it [m]; without, outlines had a step
-there."""
+"""Length over which the arm turns from the direction of the skin before the rim into its own [m]: with a sudden turn
+outlines had a step. It and `FIRST_RING` were set by eye on two hands."""
 ARM_STEP, COARSER = 0.001, 3.0
 """Distance of the arm's Gaussians at the rim [m], half of that of the skin's vertices, and how much larger it is at the
 end: with 2 mm the skin's detail ended at the rim."""
@@ -215,12 +215,11 @@ def arm_axis(rest: Float[Tensor, "V 3"], rim: Int[Tensor, "R"]) -> Float[Tensor,
     skin, which is flared, it stepped on the back.
     """
     axis = rim_axis(rest, rim)
-    lean, outward = _lean(rest, rim, axis)
-    return normalize(axis + (lean * outward).mean(0), dim=0)
+    return normalize(axis + _slopes(rest, rim, axis).mean(0), dim=0)
 
 
-def _lean(rest: Tensor, rim: Tensor, axis: Tensor) -> tuple[Float[Tensor, "R 1"], Float[Tensor, "R 3"]]:
-    """How far the skin before each point of the rim leads outward per length of `axis`, and unit vectors outward."""
+def _slopes(rest: Tensor, rim: Tensor, axis: Tensor) -> Float[Tensor, "R 3"]:
+    """How far the skin before each point of the rim leads away from the `axis`, for each length along it."""
     at = rest - rest[rim].mean(0)
     along = at @ axis
     arms = at - along[:, None] * axis
@@ -230,7 +229,7 @@ def _lean(rest: Tensor, rim: Tensor, axis: Tensor) -> tuple[Float[Tensor, "R 1"]
     share = torch.softmax(-0.5 * (apart / ASIDE).square(), 1)
     run, rise = along[before] - along[rim][:, None], radii[before] - radii[rim][:, None]
     lean = (share * run * rise).sum(1) / (share * run.square()).sum(1)
-    return lean[:, None], outward[rim]
+    return lean[:, None] * outward[rim]
 
 
 def rim_line(
@@ -278,8 +277,7 @@ def fading_arm(
     It is filled past the cap: seen along the arm, the cap would be a disc in a hollow.
     """
     edge, axis = rest[rim], arm_axis(rest, rim)
-    lean, across = _lean(rest, rim, axis)
-    slope = lean * across
+    slopes = _slopes(rest, rim, axis)
     radius = float((edge - edge.mean(0)).norm(dim=1).mean())
     n_walls = round(ARM_LENGTH / ARM_STEP * math.log(COARSER) / (COARSER - 1))
     coarser = [COARSER ** (k / n_walls) for k in range(1, n_walls)]
@@ -291,7 +289,7 @@ def fading_arm(
     fill = [(height / ARM_LENGTH, place, FILL_STEP) for height in sections for place in places]
     index, offsets, normals, tangents, scales, opacities = [], [], [], [], [], []
     for k, (share, out, length) in enumerate(walls + fill):
-        rows, arm, outward, tangent, flare = _ring(edge, axis, length / out, 0.5 * (k % 2), slope)
+        rows, arm, outward, tangent, flare = _ring(edge, axis, length / out, 0.5 * (k % 2), slopes)
         index.append(rows)
         height, wide = share * ARM_LENGTH, out * (1 + ARM_GROWTH * share**2)
         left = math.exp(-height / STRAIGHT)

@@ -40,8 +40,8 @@ class FitSettings:
     limit: float = 0.05
     """Beyond a pose limit [rad]."""
     gesture: tuple[float, float, float] = (0.25, 0.2, 0.1)
-    """Standard deviations of a real hand's flexion, abduction and twist from the gestures of the prior [rad]; chosen,
-    as `_GESTURES`, on 148 synthetic photos of a world of their own, with a look at the fits of the 66 test photos."""
+    """Standard deviations of a real hand's flexion, abduction and twist from the gestures of the prior [rad]; chosen on
+    148 synthetic photos of a world of their own, with a look at the fits of the 66 test photos."""
     relaxed: tuple[float, float, float] = (0.25, 0.45, 0.25)
     """Flexion of a finger's three joints from which fits start [rad]."""
     shape: float = 1.0
@@ -73,8 +73,8 @@ _GESTURES, _GESTURE_STEPS = 6, 4
 """Gestures from which the fit to pixels goes on, those nearest to the fit before, and the steps that compare them."""
 _SEARCHES, _WHOLE = 2, 0.03
 """Largest number of searches of the fingers' gestures, and weight there of the whole hand's pixels in each gesture,
-beside those of the finger: they decide where a finger has none. Chosen on 150 synthetic photos of a world of their
-own, on which an error of PA-MPJPE of 12.6 mm at 90 % became 8.2."""
+beside those of the finger: they decide where a finger has none. Chosen, as `_GESTURES`, on 150 synthetic photos of a
+world of their own, on which PA-MPJPE at 90 % fell from 12.6 to 8.2 mm."""
 _FIXED = 1e-4
 """Sigma of a shape coefficient that is fixed at its prior."""
 
