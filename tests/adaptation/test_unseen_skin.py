@@ -356,6 +356,8 @@ def test_a_dark_scrap_beside_a_finger_does_not_count_and_a_crease_in_the_palm_do
     assert float(found[beside & lines].mean()) > 0.9
     assert float(found[far].max()) == 0 and float(found[beside & ~lines].mean()) < 0.1
     assert float(scraps.scrap_share(hand, crop.image, crop, seen).max()) == 0
+    unsure = crop._replace(mask=0.8 * crop.mask, image=dark)  # the rest had no median, and a whole avatar became NaN
+    assert float(scraps.scrap_share(hand, crop.image, unsure, seen).max()) == 0
 
 
 def test_what_lies_just_behind_a_finger_does_not_count(hand, shown):

@@ -342,7 +342,8 @@ def test_every_row_of_the_papers_tables_is_measured(hand, tmp_path, few_steps):
     tables = make_tables("hanco", found["summary"])
     assert not found["left_out"] and all(line[1] for table in tables if table.name != "model" for line in table.lines)
     by_name = {row["row"]: row for row in json.loads((tmp_path / "metrics.json").read_text())["summary"]}
-    assert by_name["pose 10"]["psnr"] < by_name["ours"]["psnr"]
+    wrong = [by_name[f"pose {degrees}"]["psnr"] for degrees in (2, 5, 10)]  # a single one may be lucky on one picture
+    assert sum(wrong) / len(wrong) < by_name["ours"]["psnr"]
 
 
 @pytest.mark.slow

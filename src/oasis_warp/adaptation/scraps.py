@@ -59,13 +59,13 @@ def scrap_share(hand: HandModel, drawn: Float[Tensor, "S S 3"], crop: HandCrop, 
     )
     beside = torch.maximum(inside, around)
     rest = crop.mask * on * (1 - beside)
-    if float(rest.sum()) < FEWEST:
+    sure = rest > 0.9
+    if int(sure.sum()) < FEWEST:  # a soft mask may have none
         return torch.zeros_like(rest)
     beyond = (crop.image.clamp_min(MIN_COLOR) / drawn.clamp_min(MIN_COLOR)).log()
     # A little of what is beside outlines, where there is nothing else around.
     beyond = beyond - _mean_around(beyond, rest + 0.05 * crop.mask * on * beside, round(AROUND * scale))
     grey, hue = beyond.mean(-1), (beyond @ beyond.new_tensor(ACROSS_SHADING).T).norm(dim=-1)
-    sure = rest > 0.9
     usual, usual_hue = (1.48 * values[sure].median() for values in (grey.abs(), hue))
     dark = _between(-grey / usual.clamp_min(LEAST_DARK), *DARKER)
     other = _between(hue / usual_hue.clamp_min(LEAST_HUE), *OTHER_HUE)
