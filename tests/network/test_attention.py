@@ -19,6 +19,7 @@ from oasis_warp.avatar.prior import (
     MeanPrior,
 )
 from oasis_warp.core import rotation, surface
+from oasis_warp.core.hand_model import finger_of
 from oasis_warp.core.surface import faces_of_vertices
 from oasis_warp.hand.skinning import rest_hand
 from oasis_warp.network.attention import (
@@ -334,7 +335,7 @@ def test_neither_the_other_side_nor_another_finger_is_read(hand, coarse_points):
     read = coarse_points.index[coarse_points.blend]
     facing = (normals[read] * normals[:, None]).sum(-1)
     assert float((facing > 0).float().mean()) > 0.995
-    finger = torch.where(hand.segment == 0, 0, (hand.segment + 2) // 3)
+    finger = finger_of(hand.segment)
     other = (finger[read] != finger[:, None]) & (finger[read] > 0) & (finger[:, None] > 0)
     # at the webs fingers meet; away from them none is blended with its neighbour
     tips = (hand.segment > 0) & ((hand.segment - 1) % 3 == 2)

@@ -16,7 +16,7 @@ from oasis_warp.adaptation.scraps import largest, scrap_share
 from oasis_warp.avatar.anchors import PRIOR_SIZE
 from oasis_warp.avatar.observation import Observation, inner_mask, observe, sample
 from oasis_warp.core.camera import project
-from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.hand_model import HandModel, finger_of
 from oasis_warp.core.types import HandCrop
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import DepthMap, depth_map
@@ -84,7 +84,7 @@ def _behind_outline(hand: HandModel, seen: DepthMap) -> Bool[Tensor, "S S"]:
     """Whether a pixel lies just past the outline of something nearer than it."""
     on_hand, faces = seen.face_ids >= 0, hand.faces.to(seen.face_ids.device)
     segment = hand.segment.to(faces.device)[faces[seen.face_ids.clamp_min(0).long(), 0]]
-    finger = torch.where(on_hand & (segment > 0), (segment - 1) // 3, -1)
+    finger = torch.where(on_hand, finger_of(segment), 0)
     bent = on_hand & (segment > 0) & ((segment - 1) % 3 > 0)  # not the first phalanx, which joins the palm
 
     def before(where: Bool[Tensor, "S S"]) -> Float[Tensor, "S S"]:
@@ -92,7 +92,7 @@ def _behind_outline(hand: HandModel, seen: DepthMap) -> Bool[Tensor, "S S"]:
         return seen.depth + _largest(torch.where(where, -seen.depth, -torch.inf), BEHIND_REACH)
 
     behind = on_hand & (before(on_hand) > BEHIND_GAP)
-    for number in range(5):
+    for number in range(1, 6):
         behind |= on_hand & (finger != number) & (before(bent & (finger == number)) > FINGER_GAP)
     return behind
 

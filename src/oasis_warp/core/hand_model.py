@@ -1,8 +1,9 @@
 """`HandModel`: the skinned, shape-adjustable surface that every stage shares. Data only; `oasis_warp.hand` loads it."""
 
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -18,6 +19,8 @@ KNUCKLES = [5, 9, 13, 17]
 
 MANO_SHAPES = 10
 """Shape coefficients of MANO's files."""
+
+Joints = TypeVar("Joints", int, np.ndarray, Tensor)
 
 
 class ModelOrigin(NamedTuple):
@@ -92,3 +95,8 @@ class HandModel:
             if isinstance(value, Tensor):
                 moved[field.name] = value.to(device=device, dtype=dtype if value.is_floating_point() else None)
         return replace(self, **moved)
+
+
+def finger_of(joint: Joints) -> Joints:
+    """The finger of a joint, or of the bone that it moves: 1 to 5 in the order of joints, 0 for the palm."""
+    return (joint + 2) // 3

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from oasis_warp.avatar.appearance import label_regions
+from oasis_warp.core.hand_model import finger_of
 from oasis_warp.estimation.least_squares import cauchy
 from oasis_warp.hand.kinematics import HandKinematics, PosedJoints
 
@@ -84,7 +85,7 @@ class FingerContact:
         self.pad = some(facing((bone == THUMB) & soft) & (place > FROM) & (place < TO), PAD_POINTS)
         self.palm = np.flatnonzero(facing((bone == 0) & soft))[::PALM_STEP]
         self.fingers = np.flatnonzero((bone > 0) & (bone <= max(ENDS)))[::FINGER_STEP]
-        self.finger = (bone[self.fingers] - 1) // 3
+        self.finger = finger_of(bone[self.fingers]) - 1
         self.joints = np.array(ENDS)[:, None] - [2, 1, 0]
 
     def term(self, joints: PosedJoints, camera: np.ndarray) -> ContactTerm:

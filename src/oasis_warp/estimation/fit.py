@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from oasis_warp.core.hand_model import KNUCKLES
+from oasis_warp.core.hand_model import KNUCKLES, finger_of
 from oasis_warp.estimation.finger_contact import FingerContact
 from oasis_warp.estimation.fit_problem import FitState, FitTarget, Linearized
 from oasis_warp.estimation.gesture_prior import gesture_prior
@@ -133,9 +133,8 @@ class Fitter:
         self.relaxed = np.where(finger_flexion, np.array(s.relaxed)[(joint - 1) % 3], 0.0)
         self.gestures = gesture_prior(kinematics, s.gesture)
         self.contact = FingerContact(kinematics)
-        self.finger_of_vertex, self.finger_of_angle = (
-            (bone + 2) // 3 for bone in (kinematics.hand.segment.cpu().numpy(), joint)
-        )  # 0 is the palm
+        self.finger_of_vertex = finger_of(kinematics.hand.segment.cpu().numpy())
+        self.finger_of_angle = finger_of(joint)
         self.low, self.high = kinematics.limits[joint, axis].T
         n_shape = kinematics.shape_basis.shape[2]
         if shape is None:

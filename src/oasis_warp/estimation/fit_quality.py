@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.hand_model import HandModel, finger_of
 from oasis_warp.core.mirror import MIRROR
 from oasis_warp.core.types import HandFit, HandPose
 from oasis_warp.estimation.fit import FitSettings, Fitter, SurfacePoints
@@ -172,7 +172,7 @@ def stray_pixels(
     surface = kinematics.surface(kinematics.pose_joints(state.angles, state.shape))
     gap = np.linalg.norm(state.project(surface[points.vertex]) - points.xy, axis=1)
     stray = gap > _STRAY * target.box
-    finger = (kinematics.weights[points.vertex].argmax(1) + 2) // 3
+    finger = finger_of(kinematics.weights[points.vertex].argmax(1))
     warnings = []
     for number, name in enumerate(_FINGERS_OF_JOINTS, 1):
         own = stray[finger == number]
