@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.core import rotation
-from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.hand_model import TIP_JOINTS, HandModel
 from oasis_warp.core.types import PosedHand, Side
 from oasis_warp.motion.motion import angles_of_bones
 
@@ -122,7 +122,7 @@ def hand_angles(hand: HandModel, rest: PosedHand, skeleton: Skeleton, side: Side
             rotations[:, bone] = rotations[:, hand.parents[bone]]
             continue
         joint = chains[bone]
-        ahead = ours[bone + 1] if bone % 3 else rest.tips[(1, 2, 4, 3, 0)[bone // 3 - 1]].double()
+        ahead = ours[bone + 1] if bone % 3 else rest.tips[TIP_JOINTS.index(bone)].double()
         direction = aligning @ _direction(skeleton, places, joint)
         moved = aligning @ (world[:, wrist].mT @ world[:, joint]) @ aligning.T
         rotations[:, bone] = moved @ _shortest(ahead - ours[bone], direction)

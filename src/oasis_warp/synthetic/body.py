@@ -15,14 +15,12 @@ from torch import Tensor
 
 from oasis_warp.assets import asset
 from oasis_warp.core import surface
-from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.hand_model import TIP_JOINTS, HandModel
 from oasis_warp.hand.template import bundled_hand
 
 FINGERS = ("index", "middle", "little", "ring", "thumb")
 """In the order of their joints: finger k has joints 3 k + 1 to 3 k + 3."""
 THUMB = FINGERS.index("thumb")
-_TIP_OF_FINGER = (1, 2, 4, 3, 0)
-"""Row of `HandModel.tips` of each of `FINGERS`."""
 
 ARM_ROWS, ARM_LENGTH = 20, 0.30
 """Rings of the forearm, and its length [m]."""
@@ -58,7 +56,7 @@ class Bone:
 def _bone(hand: HandModel, finger: int, place: int) -> Bone:
     joint = 3 * finger + 1 + place
     start = hand.joints[joint].double().numpy() * 1e3
-    end = hand.joints[joint + 1] if place < 2 else hand.tips[_TIP_OF_FINGER[finger]]
+    end = hand.joints[joint + 1] if place < 2 else hand.tips[TIP_JOINTS.index(joint)]
     along = end.double().numpy() * 1e3 - start
     length = float(np.linalg.norm(along))
     along = along / length
