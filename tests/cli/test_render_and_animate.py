@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from oasis_warp.cli import main
-from oasis_warp.cli.animate import pose_frames, turntable
+from oasis_warp.cli.animate import draw_frames, still_camera, turntable
 from oasis_warp.core import rotation
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.logging import silent
@@ -22,6 +22,13 @@ def draw(avatar_file, *arguments, name="x.png"):
     out = avatar_file.with_name(name)
     assert main(["render", str(avatar_file), "-o", str(out), "--size", "96", *arguments]) == 0
     return np.asarray(cv2.imread(str(out), cv2.IMREAD_UNCHANGED), int)
+
+
+def pose_frames(avatar, angles, size, *, elevation, background, progress):
+    """A frame for each of the joint `angles`, from the direction of the photo; transparent without a `background`."""
+    hands = [(avatar, [avatar.source_pose._replace(angles=each.to(avatar.shape)) for each in angles])]
+    cameras = [still_camera(hands, size, elevation)] * len(angles)
+    return draw_frames(hands, cameras, background=background, progress=progress, stage="poses")
 
 
 def test_a_picture_shows_the_photos_pose_from_where_it_was_taken(scene, avatar_file):

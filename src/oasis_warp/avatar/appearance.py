@@ -137,10 +137,7 @@ def region_colors(regions: Regions, melanin: float) -> Float[Tensor, "V 3"]:
     return ((1 - nail[:, None]) * skin + nail[:, None] * nails) * shade[:, None]
 
 
-REGION_NAMES = ("palm", "back", "nail")
-
-
 def region_masks(regions: Regions) -> dict[str, Float[Tensor, "V"]]:
-    """Weights that split the surface into `REGION_NAMES`, for statistics."""
+    """Weights that split the surface into palm, back and nail, for statistics."""
     skin = 1 - regions.nail
     return {"palm": regions.palm * skin, "back": (1 - regions.palm) * skin, "nail": regions.nail}

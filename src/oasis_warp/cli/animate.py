@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from torch import Tensor
 
 from oasis_warp.cli.options import Animate
@@ -84,21 +84,6 @@ def around(
     """Cameras on a circle around hands that stand still."""
     vertices = torch.cat([avatar.mesh(poses[0]).vertices for avatar, poses in hands])
     return [orbit_camera(vertices, 2 * math.pi * frame / n_frames, elevation, size) for frame in range(n_frames)]
-
-
-def pose_frames(
-    avatar: Avatar,
-    angles: Sequence[Float[Tensor, "15 3"]],
-    size: int,
-    *,
-    elevation: float,
-    background: Color | None,
-    progress: Progress,
-) -> Iterator[UInt8[Tensor, "size size C"]]:
-    """A frame for each of the joint `angles`, from the direction of the photo; transparent without a `background`."""
-    hands = [(avatar, [avatar.source_pose._replace(angles=each.to(avatar.shape)) for each in angles])]
-    camera = still_camera(hands, size, elevation)
-    return draw_frames(hands, [camera] * len(angles), background=background, progress=progress, stage="poses")
 
 
 @torch.no_grad()

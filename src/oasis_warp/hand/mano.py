@@ -21,7 +21,6 @@ from oasis_warp.core.rotation import from_vector
 from oasis_warp.core.types import Side
 
 N_VERTICES, N_FACES = 778, 1538
-N_HD_VERTICES, N_HD_FACES = 12_337, 24_608
 N_RIM = 16
 PARENTS = (-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14)
 TIP_VERTICES = (744, 320, 443, 554, 671)
@@ -201,25 +200,6 @@ def subsample(model: ManoModel, step: int = 20) -> ManoModel:
     """The same joints with every `step`-th vertex, for checks; its faces are those of the whole surface."""
     names = ("template", "shape_basis", "pose_basis", "weights")
     return replace(model, **{name: getattr(model, name)[::step] for name in names})
-
-
-def mirror_mano(model: ManoModel) -> ManoModel:
-    """The other hand: its mirror image at x = 0, with faces that wind outwards again."""
-    flip = np.array([-1.0, 1.0, 1.0])
-    signs = np.outer(flip, flip).ravel()  # of R - 1 in the mirror, M R M - 1
-    return ManoModel(
-        side="right" if model.side == "left" else "left",
-        template=model.template * flip,
-        faces=model.faces[:, ::-1].copy(),
-        shape_basis=model.shape_basis * flip[:, None],
-        pose_basis=model.pose_basis * flip[:, None] * np.tile(signs, 15),
-        regressor=model.regressor,
-        coarse_template=model.coarse_template * flip,
-        coarse_shapes=model.coarse_shapes * flip[:, None],
-        weights=model.weights,
-        pose_components=model.pose_components * np.tile(-flip, 15),
-        pose_mean=model.pose_mean * -flip,
-    )
 
 
 def mirror_mano_pose(pose: ManoPose) -> ManoPose:
