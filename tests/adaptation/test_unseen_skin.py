@@ -1,24 +1,14 @@
 """Skin that no photo shows is painted on; what may be background, or a finger before the palm, is no skin."""
 
-import igl
-import numpy as np
 import pytest
 import torch
-import trimesh
 from synthetic import PALM_TO_CAMERA, crop_of
 
 from oasis_warp.adaptation import reliability, scraps
 from oasis_warp.adaptation.adapt import adapt
-from oasis_warp.adaptation.inpainting import FADE_LENGTH, inpaint, laplacian_and_mass
 from oasis_warp.adaptation.reliability import mask_unreliable
 from oasis_warp.adaptation.skin_detail import Places, flush_shade, relief, sample_detail
-from oasis_warp.adaptation.unseen_skin import (
-    MORE,
-    SEEN,
-    _clarities,
-    _skin_detail,
-    paint_unseen,
-)
+from oasis_warp.adaptation.unseen_skin import MORE, SEEN, _clarities, _skin_detail, paint_unseen
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.densify import coarsen
@@ -218,51 +208,6 @@ def test_without_shade_what_the_photo_shows_on_a_slant_stays(hand, palm_photo):
     shown = (first.visibility == 1) & (first.facing > 0)
     on = shown[bare.vertex_index]
     assert torch.equal(*(g.colors[: len(on)][on] for g in (bare, made.gaussians)))
-
-
-def hand_sized_sphere():
-    mesh = trimesh.creation.icosphere(subdivisions=5, radius=0.05)
-    return torch.from_numpy(np.array(mesh.vertices)), torch.from_numpy(np.array(mesh.faces))
-
-
-def test_what_is_seen_is_kept_and_what_is_far_from_it_is_the_prior():
-    vertices, faces = hand_sized_sphere()
-    seen = (vertices[:, 2] > 0).double()
-    field = inpaint(vertices, faces, torch.full((len(vertices), 1), 0.3, dtype=torch.float64), seen)
-    assert float(field[vertices[:, 2] > 0.01].min()) > 0.29
-    assert float(field[vertices[:, 2] < -0.045].abs().max()) < 0.3 * np.exp(-0.05 / FADE_LENGTH) * 3
-
-
-def test_there_is_no_step_at_the_border_of_the_seen_region():
-    vertices, faces = hand_sized_sphere()
-    seen = (vertices[:, 2] > 0).double()
-    field = inpaint(vertices, faces, torch.full((len(vertices), 1), 0.3, dtype=torch.float64), seen)[:, 0]
-    edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    assert float((field[edges[:, 0]] - field[edges[:, 1]]).abs().max()) < 0.05
-
-
-def test_the_field_never_leaves_the_range_of_what_was_seen():
-    vertices, faces = hand_sized_sphere()
-    generator = torch.Generator().manual_seed(0)
-    observed = torch.rand(len(vertices), 3, generator=generator, dtype=torch.float64)
-    field = inpaint(vertices, faces, observed, (vertices[:, 0] > 0).double())
-    assert float(field.min()) > -1e-3
-    assert float(field.max()) < 1
-
-
-def test_nothing_seen_is_nothing_added():
-    vertices, faces = hand_sized_sphere()
-    field = inpaint(vertices, faces, torch.ones(len(vertices), 3), torch.zeros(len(vertices)))
-    assert float(field.abs().max()) == 0
-
-
-def test_laplacian_and_mass_are_those_of_libigl(hand):
-    points, triangles = hand.template.double().numpy(), hand.faces.numpy()
-    laplacian, mass = laplacian_and_mass(points, triangles)
-    # libigl works on squared lengths and loses digits on slivers, whose cotangents are large
-    assert abs(laplacian + igl.cotmatrix(points, triangles)).max() < 1e-6 * abs(laplacian).max()
-    theirs = igl.massmatrix(points, triangles, igl.MASSMATRIX_TYPE_BARYCENTRIC).diagonal()
-    assert mass == pytest.approx(theirs, rel=1e-9)
 
 
 SKIN, WALL = (0.7, 0.5, 0.4), (0.1, 0.3, 0.8)
