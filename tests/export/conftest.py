@@ -6,6 +6,7 @@ from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.core import surface
 from oasis_warp.core.types import HandLight
 from oasis_warp.export import texture
+from oasis_warp.export.page_file import page_html
 
 
 @pytest.fixture(scope="session")
@@ -25,6 +26,11 @@ def left_hand(right_hand):
 @pytest.fixture(params=["left", "right"])
 def avatar(request, left_hand, right_hand):
     return {"left": left_hand, "right": right_hand}[request.param]
+
+
+@pytest.fixture(scope="session")
+def pages(left_hand, right_hand):
+    return {avatar.side: page_html(avatar, "A <hand>") for avatar in (left_hand, right_hand)}
 
 
 @pytest.fixture

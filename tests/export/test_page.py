@@ -1,6 +1,7 @@
+"""The page in one file: what it holds, and what browsers draw of it."""
+
 import base64
 import contextlib
-import dataclasses
 import hashlib
 import html
 import json
@@ -17,44 +18,25 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from synthetic import avatar_of, crop_of
+from tests.export.page_parts import LARGEST, section
 
-from oasis_kernels import constants
-from oasis_warp.avatar import pose
 from oasis_warp.avatar.sky import studio_light
-from oasis_warp.core.camera import ORBIT_FIELD_OF_VIEW, orbit_camera
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.data.splat_files import read_splats
 from oasis_warp.export import export_avatar
-from oasis_warp.export.page_file import joint_sliders, page_html, page_text, splats_html, unpack_data
+from oasis_warp.export.page_file import joint_sliders, page_html, splats_html, unpack_data
 from oasis_warp.hand import skinning as hand_skinning
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
-from oasis_warp.ops import bone_transforms, contact, skin, sky_exposure
-from oasis_warp.reference import posing
+from oasis_warp.ops import bone_transforms, skin
 from oasis_warp.render import render
 
-LARGEST = 8_000_000
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 FIREFOX = shutil.which("xvfb-run") and (shutil.which("firefox-esr") or shutil.which("firefox"))
 """Without a display it has no WebGL."""
-NODE = shutil.which("node")
 with_chromium, with_firefox = (
     pytest.param(name, marks=pytest.mark.skipif(path is None, reason=f"needs {name}, firefox also xvfb"))
     for name, path in (("chromium", CHROMIUM), ("firefox", FIREFOX))
 )
-
-
-@pytest.fixture(scope="module")
-def pages(left_hand, right_hand):
-    return {avatar.side: page_html(avatar, "A <hand>") for avatar in (left_hand, right_hand)}
-
-
-def section(page, name):
-    (text,) = re.findall(f'<script id="{name}" type="text/plain">(.*?)</script>', page, re.DOTALL)
-    return text
-
-
-def in_pose(avatar, name):
-    return avatar.held(name)
 
 
 def test_the_page_is_one_file_that_fetches_nothing(pages):
@@ -109,7 +91,7 @@ def test_what_the_page_reads_poses_the_same_surface(avatar, pages, name):
         displacements=correctives.contiguous(),
         strengths=bones.bends,
     )
-    expected = hand_skinning.skin(*avatar.parts[:2], in_pose(avatar, name)).vertices  # nothing gives way there
+    expected = hand_skinning.skin(*avatar.parts[:2], avatar.held(name)).vertices  # nothing gives way there
     assert (posed.means - expected).abs().max() < 2e-5  # 16 bit for weights and correctives
 
 
@@ -139,7 +121,7 @@ def test_sliders_move_what_they_say_within_the_limits(hand):
 
 def test_the_page_begins_with_the_pose_and_light_that_were_asked_for(right_hand, tmp_path):
     out = tmp_path / "hand.html"
-    export_avatar(right_hand, out, pose=in_pose(right_hand, "fist"), light="none")
+    export_avatar(right_hand, out, pose=right_hand.held("fist"), light="none")
     start = unpack_data(section(out.read_text(), "data"))[0]["start"]
     assert (start["pose"], start["look"]) == ("fist", "even")
     assert np.allclose(start["angles"], named_pose(right_hand.hand, "fist").flatten(), atol=1e-6)
@@ -150,122 +132,6 @@ def test_an_avatar_without_light_of_its_own_begins_in_even_light(right_hand):
     assert facts["start"]["look"] == "even"
     assert facts["lights"].keys() == {"studio"}
     assert (arrays["even"] == 1).all()
-
-
-@pytest.mark.parametrize(
-    ("file", "name", "value"),
-    [
-        ("shading.js", "GAMMA", pose.GAMMA),
-        ("shading.js", "SAME_POSE", pose.SAME_POSE),
-        ("shading.js", "OTHER_POSE", pose.OTHER_POSE),
-        ("shading.js", "SAME_SKY", pose.SAME_SKY),
-        ("shading.js", "OTHER_SKY", pose.OTHER_SKY),
-        ("shading.js", "SAME_BESIDE", pose.SAME_BESIDE),
-        ("shading.js", "OTHER_BESIDE", pose.OTHER_BESIDE),
-        ("shading.js", "WEAK", pose.WEAK),
-        ("shading.js", "DEEP", pose.DEEP),
-        ("sky.js", "BUFFER", sky_exposure.SIZE),
-        ("sky.js", "FAR", sky_exposure.DISTANCE),
-        ("sky.js", "MARGIN", sky_exposure.MARGIN),
-        ("sky.js", "LIFT", sky_exposure.LIFT),
-        ("contact.js", "DEEPEST", contact.DEEPEST),
-        ("contact.js", "ASIDE", contact.ASIDE),
-        ("contact.js", "PUSH", contact.MARGIN),
-        ("contact.js", "PAD", contact.PAD),
-        ("contact.js", "OPPOSED", contact.OPPOSED),
-        ("contact.js", "PARTS_OPPOSED", contact.PARTS_OPPOSED),
-        ("contact.js", "FADES", contact.FADES),
-        ("contact.js", "ROUNDS", contact.ROUNDS),
-        ("posing.js", "FLAT", posing.FLAT),
-        ("posing.js", "DAMPING", posing.DAMPING),
-        ("posing.js", "MAX_GROWTH", posing.LIMIT),
-        ("projection.js", "EPS2D", constants.EPS2D),
-        ("projection.js", "JACOBIAN_LIMIT", constants.JACOBIAN_LIMIT),
-        ("raster.js", "EXACT = { opaque: 1 / 100, reach:", constants.EXTENT_SIGMAS),
-    ],
-)
-def test_the_script_has_the_constants_of_the_operators(file, name, value):
-    sign = "" if name.endswith(":") else " ="
-    (found,) = re.findall(rf"\b{re.escape(name)}{sign} ([\d.e-]+)", page_text(file))
-    assert float(found) == pytest.approx(value, rel=1e-12)
-
-
-NODE_CHECK = """
-const fs = require("fs"), read = (path) => fs.readFileSync(path, "utf8");
-const [folder, jobs] = [process.argv[1], JSON.parse(process.argv[2])];
-const run = new Function(read(folder + "/worker.js") + "; return { openHand, drawHand };")();
-run.openHand(read(folder + "/data.txt")).then((hand) => {
-  for (const [k, job] of jobs.entries()) {
-    const { facts, ...wish } = { ...job, camera: { ...job.camera, target: null } };
-    wish.angles = hand.body.data.poses.find(({ name }) => name === job.pose).angles;
-    run.drawHand(hand, wish);
-    const bytes = (array) => Buffer.from(array.buffer, array.byteOffset, array.byteLength);
-    fs.writeFileSync(`${folder}/means${k}`, bytes(hand.gaussians.means));
-    fs.writeFileSync(`${folder}/covars${k}`, bytes(hand.gaussians.covariances));
-    fs.writeFileSync(`${folder}/colors${k}`, bytes(hand.shading.colors));
-  }
-});
-"""
-
-
-def run_script(page, jobs, folder):
-    """Pose and light the page's hand with its own script; means, covariances and colours as files of `folder`."""
-    for name, file in (("worker", "worker.js"), ("data", "data.txt")):
-        (folder / file).write_text(section(page, name))
-    camera = {"azimuth": 0, "elevation": 0, "zoom": 1, "fieldOfView": ORBIT_FIELD_OF_VIEW, "width": 64, "height": 64}
-    jobs = [job | {"camera": camera | {"azimuth": job.get("azimuth", 0)}} for job in jobs]
-    subprocess.run([NODE, "-e", NODE_CHECK, str(folder), json.dumps(jobs)], check=True, timeout=200)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(NODE is None, reason="needs node")
-def test_the_pages_script_poses_a_hand_of_mano_with_all_of_its_correctives(mano, tmp_path):
-    crop, truth, pose = crop_of(mano, torch.full((len(mano.template), 3), 0.5), size=64)
-    avatar = avatar_of(mano, truth, pose, crop.camera)
-    page = page_html(avatar, "MANO")
-    assert len(page) <= LARGEST  # 16 bits a corrective made it 15 MB
-    run_script(page, [{"pose": "fist", "look": "photo"}], tmp_path)
-    _, arrays = unpack_data(section(page, "data"))
-    basis = arrays["correctives"].reshape(-1, len(mano.template), 3) * arrays["reach"][:, None, None]
-    rounded = dataclasses.replace(mano, corrective_basis=torch.from_numpy(basis).permute(1, 2, 0).to(mano.template))
-    expected = avatar_of(rounded, truth, pose, crop.camera)  # rounding moves vertices by some .1 mm
-    means = np.fromfile(tmp_path / "means0", "<f4").reshape(-1, 3)
-    apart = np.abs(means - expected.pose(in_pose(avatar, "fist")).means.numpy())
-    assert np.quantile(apart, 0.999) < 3e-5 and apart.max() < 3e-4  # contact of a fist decides by rounded distances
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(NODE is None, reason="needs node")
-def test_the_pages_script_poses_and_lights_as_python_does(avatar, pages, tmp_path):
-    lights = {"photo": avatar, "studio": avatar.in_light(studio_light()), "even": avatar.in_even_light()}
-    jobs = [{"pose": pose, "look": look} for pose in ("fist", "victory") for look in lights]
-    run_script(pages[avatar.side], jobs, tmp_path)
-    for k, job in enumerate(jobs):
-        expected = lights[job["look"]].pose(in_pose(avatar, job["pose"]))
-        means = np.fromfile(tmp_path / f"means{k}", "<f4").reshape(-1, 3)
-        off = np.abs(means - expected.means.numpy()).max(1)
-        assert np.quantile(off, 0.999) < 3e-5 and off.max() < 3e-4  # contact of a fist decides by rounded distances
-        variances = np.fromfile(tmp_path / f"covars{k}", "<f4").reshape(-1, 6)[:, [0, 3, 5]].sum(1)
-        growth = variances / expected.scales.square().sum(1).numpy()
-        assert np.quantile(np.abs(growth - 1), 0.99) < 0.02  # 16 bits move the corners of small faces
-        bytes_ = np.fromfile(tmp_path / f"colors{k}", np.uint8).reshape(-1, 4)
-        error = np.abs(bytes_[:, :3] - 255 * expected.colors.numpy())
-        assert np.quantile(error, 0.98) < 2.5, job  # a pixel of a depth buffer decides about vertices within 10 mm
-        assert error.mean() < 0.5, job
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(NODE is None, reason="needs node")
-def test_the_pages_script_fades_shade_as_python_does_when_the_camera_leaves(shaded, tmp_path):
-    jobs = [{"pose": "photo", "look": "photo", "azimuth": angle} for angle in (0.0, 0.35, -0.5, 1.0, 0.35)]
-    run_script(page_html(shaded, "A hand"), jobs, tmp_path)
-    colors = []
-    for k, job in enumerate(jobs):
-        camera = orbit_camera(shaded.mesh(shaded.source_pose).vertices, job["azimuth"], 0.0, 64)
-        expected = 255 * shaded.pose(shaded.source_pose, camera=camera).colors.numpy()
-        colors.append(np.fromfile(tmp_path / f"colors{k}", np.uint8).reshape(-1, 4)[:, :3])
-        assert np.abs(colors[k] - expected).max() < 2, job
-    assert np.abs(colors[3].astype(float) - colors[0]).mean() > 5 and (colors[4] == colors[1]).all()
 
 
 REPORT = """
@@ -358,7 +224,7 @@ def test_a_browser_draws_the_page_as_we_do(left_hand, right_hand, pages, tmp_pat
     lights = {"photo": avatar, "studio": avatar.in_light(studio_light()), "even": avatar.in_even_light()}
     pictures = pictures_of(pages[avatar.side], drawing, jobs, tmp_path / "profile", browser)
     for shown, (name, degrees, look) in zip(pictures, views, strict=True):
-        pose = avatar.source_pose if name == "photo" else in_pose(avatar, name)
+        pose = avatar.source_pose if name == "photo" else avatar.held(name)
         camera = orbit_camera(avatar.mesh(pose).vertices, np.radians(degrees), 0.0, 256)
         drawn = lights[look].render(camera, pose).image.clamp(0, 1).numpy()
         assert -10 * np.log10(np.mean((shown - drawn) ** 2)) > 40, (name, look)
