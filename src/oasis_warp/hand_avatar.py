@@ -43,6 +43,7 @@ from oasis_warp.core.types import (
     Side,
 )
 from oasis_warp.data.avatar_file import DARK_HOLLOWS, load_avatar, save_avatar
+from oasis_warp.data.stored_avatar import StoredAvatar, from_file, to_header, to_tensors
 from oasis_warp.hand.contact import resolve_contact
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin, skin_surface
@@ -306,27 +307,8 @@ class Avatar:
 
     def save(self, path: Path | str) -> None:
         """Write the avatar file (safetensors, versioned; see docs/avatar_file.md)."""
-        camera, pose, gaussians = self.source_camera, self.source_pose, self.gaussians
-        tensors = {
-            "shape": self.shape,
-            "surface_offsets": self.surface_offsets,
-            **{f"gaussians.{name}": value for name, value in gaussians._asdict().items() if value is not None},
-            **{f"source_pose.{name}": value for name, value in pose._asdict().items()},
-            "source_camera.viewmat": camera.viewmat,
-            "source_camera.K": camera.K,
-        }
-        if self.light is not None:
-            light = self.light._asdict()
-            tensors |= {f"light.{name}": value for name, value in light.items() if value is not None}
-        if self.invented is not None:
-            tensors["invented"] = self.invented
-        header = {
-            "side": self.side,
-            "hand_model": self.hand.name,
-            "hand_licence": self.hand.licence,
-            "source_camera": {"width": camera.width, "height": camera.height},
-        }
-        save_avatar(Path(path), {name: value.detach().cpu() for name, value in tensors.items()}, header)
+        stored = StoredAvatar(*(getattr(self, name) for name in StoredAvatar._fields))
+        save_avatar(Path(path), to_tensors(stored), to_header(stored, self.hand))
 
     @classmethod
     def load(
@@ -347,22 +329,8 @@ class Avatar:
         tensors, header = load_avatar(Path(path), {hand.name: sizes, "mano": sizes | {"S": MANO_SHAPES}})
         if header["hand_model"] != hand.name:
             hand = chosen_hand("mano", mano_dir)
-        tensors = {name: value.to(device) for name, value in tensors.items()}
-
-        def group(prefix: str) -> dict[str, Tensor]:
-            return {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
-
-        avatar = cls(
-            side=header["side"],
-            shape=tensors["shape"],
-            surface_offsets=tensors["surface_offsets"],
-            gaussians=CanonicalGaussians(**group("gaussians.")),
-            source_pose=HandPose(**group("source_pose.")),
-            source_camera=Camera(**group("source_camera."), **header["source_camera"]),
-            light=HandLight(**light) if (light := group("light.")) else None,
-            invented=tensors.get("invented"),
-            hand=hand,
-        )
+        stored = from_file({name: value.to(device) for name, value in tensors.items()}, header)
+        avatar = cls(**stored._asdict(), hand=hand)
         return avatar._with_todays_light(header["version"]) if header["version"] < DARK_HOLLOWS else avatar
 
     @torch.no_grad()
