@@ -119,6 +119,16 @@ def test_its_vertices_lie_where_the_bundled_hand_has_the_same_skin(mano):
     assert ((crosses[0] * crosses[1]).sum(1) > 0).all()  # no face turned over
 
 
+def test_every_bone_ends_at_its_own_fingers_joint_or_tip(hand):
+    """The ends of ring and little finger were swapped: that bone was 51 mm long instead of 24."""
+    rows = torch.cat([hand.joints, hand.tips])
+    for joint, end in making.bone_ends().items():
+        assert float((rows[end] - rows[joint]).norm()) < 0.06
+        if end > 15:
+            others = (rows[16:] - rows[joint]).norm(dim=1)
+            assert int(others.argmin()) == end - 16
+
+
 def test_its_parameters_pass_in_and_out(mano, mano_dir):
     fine = mano_hd(read_mano(mano_dir))
     found = mano.template.double().numpy() + mano.origin.wrist.numpy()

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from oasis_warp.core import surface
 from oasis_warp.core.errors import InputError
-from oasis_warp.core.hand_model import HandModel, ModelOrigin
+from oasis_warp.core.hand_model import TIP_JOINTS, HandModel, ModelOrigin
 from oasis_warp.core.rotation import euler_angles, euler_rotations
 from oasis_warp.core.types import HandPose
 from oasis_warp.hand.kinematics import HandKinematics, PosedJoints, bundled_kinematics, rotation_between, unit
@@ -274,7 +274,7 @@ def _along_bones(kinematics: HandKinematics, model: ManoModel) -> PlacedHand:
             f"MANO's template: its palm is turned by {turned:.0f} degrees against the bundled hand's, expected up to "
             f"{MAX_TURNED:.0f}; give MANO's own files, fingers to -x, palm to -y, thumb to +z."
         )
-    ends = {j: j + 1 for j in range(1, 16) if j % 3} | {15: 16, 3: 17, 6: 18, 12: 20, 9: 19}
+    ends = bone_ends()
     world, angles = np.repeat(rotation[None], 16, 0), np.zeros((16, 3))
     for j in range(1, 16):
         parent = world[PARENTS[j]]
@@ -286,6 +286,12 @@ def _along_bones(kinematics: HandKinematics, model: ManoModel) -> PlacedHand:
         axes = kinematics.axes[j]
         angles[j] = euler_angles(torch.from_numpy(axes @ local @ axes.T)).numpy()
     return PlacedHand(angles, np.zeros(kinematics.shape_basis.shape[2]), rotation, translation)
+
+
+def bone_ends() -> dict[int, int]:
+    """Where the bone of each joint ends: a row of the 16 joints followed by the five tips, from thumb to little finger."""
+    inner = {joint: joint + 1 for joint in range(1, 16) if joint % 3}
+    return inner | {joint: 16 + k for k, joint in enumerate(TIP_JOINTS)}
 
 
 def _normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
