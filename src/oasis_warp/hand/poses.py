@@ -49,7 +49,7 @@ _THUMBS: dict[str, Thumb] = {
     "thumbs_up": (-14, 16, 0, 3, -10),
     "victory": (43, 15, -18, 37, 44),
     "point": (33, 17, -18, 43, 61),
-    "ok": (32, 10, -11, 13, 12),
+    "ok": (12, 0, 1, 37, 44),
 }
 
 _FINGERS: dict[str, dict[str, Finger]] = {
@@ -64,7 +64,7 @@ _FINGERS: dict[str, dict[str, Finger]] = {
     "thumbs_up": _FIST,
     "victory": {**_FIST, "index": (2, 6, 4, 12), "middle": (2, 6, 4, -8)},
     "point": {**_FIST, "index": (2, 6, 4, 0)},
-    "ok": {"index": (53, 53, 31, -8), "middle": (8, 12, 6, 0), "ring": (4, 8, 4, -4), "little": (0, 4, 2, -8)},
+    "ok": {"index": (48, 59, 37, 3), "middle": (6, 12, 8, 0), "ring": (2, 8, 6, -4), "little": (-2, 5, 4, -10)},
 }  # fmt: skip
 
 POSE_NAMES = ("rest", *_FINGERS)
