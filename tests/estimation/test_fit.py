@@ -9,6 +9,7 @@ from oasis_warp.core.rotation import from_axis_angle
 from oasis_warp.estimation.fit import Fitter, OutlinePairs, SurfacePoints
 from oasis_warp.estimation.fit_problem import FitState, fit_target
 from oasis_warp.estimation.fit_quality import (
+    FitQuality,
     draw_silhouette,
     framing_warnings,
     iou_above_wrist,
@@ -289,3 +290,12 @@ def test_a_hand_that_was_turned_away_misses_its_landmarks(hand, fitted):
     assert moved.reprojection > 3 * fit.reprojection
     assert not keeps_quality(moved, fit)
     assert keeps_quality(moved, moved)
+
+
+def test_a_fit_with_wrong_landmarks_is_used_where_outline_and_pixels_agree_with_it():
+    """Since pixels outweigh landmarks, good fits left wrong ones behind and were refused for them."""
+    good = FitQuality(reprojection=8.8, worst_point=20.0, mask_iou=0.97, cost=150.0)
+    assert good.refused(stray=0.05) == [] and any("reprojection" in words for words in good.warnings())
+    assert len(good.refused(stray=0.15)) == 1 and len(replace(good, mask_iou=0.95).refused(stray=0.05)) == 1
+    assert len(replace(good, cost=600.0).refused(stray=0.05)) == 1
+    assert len(replace(good, reprojection=2.0).refused(stray=0.4)) == 1

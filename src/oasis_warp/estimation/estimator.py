@@ -17,8 +17,6 @@ from oasis_warp.estimation.fit import Fitter, Solution, SurfacePoints
 from oasis_warp.estimation.fit_problem import MirroredInput, array, real
 from oasis_warp.estimation.fit_quality import (
     MANY_FINGERS,
-    REFUSE_BOUNDS,
-    STRAY_SHARE,
     TINY_HAND,
     finger_warnings,
     fit_quality,
@@ -142,11 +140,9 @@ class HandEstimator:
         if landmarks.world is not None:  # 21 points in the plane alone do not tell a palm from the other hand's back
             costs = side_costs(self.kinematics, view.target, known_shape)
             warnings += side_warnings(landmarks.side, *costs, detections)
-        refused = quality.beyond(REFUSE_BOUNDS)
+        refused = quality.refused(stray)
         if len(fingers) >= MANY_FINGERS:
             refused.append("a second detection places the hand elsewhere")
-        if stray > STRAY_SHARE:
-            refused.append(f"{100 * stray:.0f} % of the hand's pixels do not match the model")
         if refused and not force:
             raise InputError(
                 f"{photo.name}: the fit of the {landmarks.side} hand is too poor to use, {' and '.join(refused)}; "

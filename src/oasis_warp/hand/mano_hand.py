@@ -289,7 +289,7 @@ def _along_bones(kinematics: HandKinematics, model: ManoModel) -> PlacedHand:
 
 
 def bone_ends() -> dict[int, int]:
-    """Where the bone of each joint ends: a row of the 16 joints followed by the five tips, from thumb to little finger."""
+    """Where the bone of each joint ends: a row of the joints followed by the five tips, from thumb to little finger."""
     inner = {joint: joint + 1 for joint in range(1, 16) if joint % 3}
     return inner | {joint: 16 + k for k, joint in enumerate(TIP_JOINTS)}
 
