@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from oasis_warp.avatar.folds import Folds, find_folds, open_folds
 from oasis_warp.avatar.pose import (
     GAMMA,
     SurfaceLight,
@@ -64,6 +65,8 @@ class AvatarParts(NamedTuple):
     rest: PosedHand
     gaussians: CanonicalGaussians
     light: SurfaceLight | None
+    folds: Folds | None
+    """Which open in `light` when fingers bend."""
 
 
 class Avatar:
@@ -116,12 +119,13 @@ class Avatar:
         self._canonical = mirror_canonical(gaussians) if left else gaussians
         vertices = self._rest.vertices
         self._rest_mesh = vertices if vertices.requires_grad else rest_mesh(vertices, self.hand.faces, validate=False)
-        self._light = None
+        self._light = self._folds = None
         if light is not None:
             camera = mirror_camera(source_camera) if left else source_camera
             center = camera_center(camera.viewmat.to(vertices))
             known = with_photo(light, self.rest.vertices, self._photo_surface(), self.hand.faces, center)
             self._light = mirror_surface_light(known) if left else known
+            self._folds = find_folds(self.hand, gaussians, invented, source_pose.angles.to(vertices))
         self._fixed = *(part for part in self._canonical if part is not None), vertices, self._rest.joints
         self._source_angles = source_pose.angles.to(self.shape)
         self._graphs = GraphCache()
@@ -140,7 +144,7 @@ class Avatar:
     @property
     def parts(self) -> AvatarParts:
         """The inputs of `pose`, for programs with a posing of their own."""
-        return AvatarParts(self._model, self._rest, self._canonical, self._light)
+        return AvatarParts(self._model, self._rest, self._canonical, self._light, self._folds)
 
     @property
     def device(self) -> torch.device:
@@ -218,7 +222,8 @@ class Avatar:
                 check_finite(viewmat=camera.viewmat)
             center = camera_center(camera.viewmat.to(self.shape))
         posed = self._resolve_contact(skin_surface(self._model, self._rest, checked), checked)
-        return pose_gaussians(self._canonical, self.hand.faces, self._rest_mesh, posed, self._light, center)
+        opening = None if self._folds is None else open_folds(self._folds, checked.angles)
+        return pose_gaussians(self._canonical, self.hand.faces, self._rest_mesh, posed, self._light, center, opening)
 
     def render(
         self, camera: Camera, pose: HandPose | str, background: Color = WHITE, *, validate: bool = True

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from oasis_warp.avatar.anchors import vertex_to_gaussians
+from oasis_warp.avatar.folds import Opening
 from oasis_warp.avatar.sky import arriving, arriving_before, exposure, harmonic_basis, largest_nearby
 from oasis_warp.core import rotation, surface
 from oasis_warp.core.mirror import mirror_light, mirror_points
@@ -180,25 +181,39 @@ def shading_factors(
     on: Lighting,
     seen: Float[Tensor, "V"] | None = None,
     viewed: Float[Tensor, "*B"] | None = None,
+    opening: Opening | None = None,
 ) -> Float[Tensor, "*B N 3"]:
-    """Factors by which `light` multiplies the colours of Gaussians.
+    """Factors by which `light`, and the `opening` of folds, multiply the colours of Gaussians.
 
-    Without `seen` those in the photo itself; `viewed` is the `view_share`, 1 if not given.
+    Without `seen` those in the photo itself; `viewed` is the `view_share`, 1 if not given. Nothing opens as far as the
+    photo's weak shade stays.
     """
     of_vertices = shading(light, on)
     if light.facing is None:
-        return _at_gaussians(of_vertices, faces, canonical)
+        return _opened(_at_gaussians(of_vertices, faces, canonical), opening)
     stays = remaining_shade(light, on, seen)
     if viewed is not None:
         stays = stays * viewed[..., None, None]
     if light.shade is not None:  # all of it is smooth, or of pixels beside outlines
         of_vertices = of_vertices * (1 + stays[..., :1] * (light.shade - 1))
-    if canonical.shade is None:
+    if canonical.shade is None and opening is None:
         return _at_gaussians(of_vertices, faces, canonical)
     read = _at_gaussians(torch.cat([of_vertices, stays], -1), faces, canonical)
+    factors = _opened(read[..., :3], opening, read[..., 4:])
+    if canonical.shade is None:
+        return factors
     beyond = canonical.shade - 1
     deep = ((beyond.abs().amax(-1, keepdim=True) - WEAK) / (DEEP - WEAK)).clamp(0, 1)
-    return read[..., :3] * (1 + torch.lerp(read[..., 4:], read[..., 3:4], deep) * beyond)
+    return factors * (1 + torch.lerp(read[..., 4:], read[..., 3:4], deep) * beyond)
+
+
+def _opened(
+    factors: Float[Tensor, "*B N 3"], opening: Opening | None, stays: Float[Tensor, "*B N 1"] | None = None
+) -> Float[Tensor, "*B N 3"]:
+    if opening is None:
+        return factors
+    logs = opening.logs if stays is None else opening.logs * (1 - stays.index_select(-2, opening.index))
+    return factors.index_copy(-2, opening.index, factors.index_select(-2, opening.index) * logs.exp())
 
 
 def _at_gaussians(
@@ -272,6 +287,7 @@ def pose_gaussians(
     posed_vertices: Float[Tensor, "*B V 3"],
     light: SurfaceLight | None = None,
     center: Float[Tensor, "3"] | None = None,
+    opening: Opening | None = None,
 ) -> Gaussians:
     """Gaussians that follow the surface from `rest_vertices` to `posed_vertices` (the paper's appendix B.1).
 
@@ -280,7 +296,8 @@ def pose_gaussians(
     are not checked here: the caller has checked the pose. A surface that is posed many times is given as its
     `rest_mesh`. If `posed_vertices` have a leading axis of poses, so have means, quats and scales. With a `light`, so
     have the colours: they are drawn in it, without the part that the posed surface hides. With the `center` of a
-    camera, shade fades as that camera leaves the side of the photo; without, it is as the photo's camera saw it.
+    camera, shade fades as that camera leaves the side of the photo; without, it is as the photo's camera saw it. With
+    an `opening`, folds over bent joints are open in that light.
     """
     means, quats, scales, vertex_quats = pose_mesh_gaussians(
         rest_vertices, posed_vertices, faces, canonical.face_index, canonical.barycentrics, canonical.vertex_index,
@@ -292,6 +309,6 @@ def pose_gaussians(
         viewed = None
         if center is not None and light.photo_view is not None:
             viewed = view_share(light.photo_view, view_direction(posed_vertices, center))
-        factors = shading_factors(canonical, faces, light.light, on, light.seen, viewed)
+        factors = shading_factors(canonical, faces, light.light, on, light.seen, viewed, opening)
         colors = (colors * factors).clamp(0, 1)
     return Gaussians(means, quats, scales, canonical.opacities, colors)

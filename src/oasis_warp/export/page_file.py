@@ -18,6 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp import __version__
+from oasis_warp.avatar.folds import Folds
 from oasis_warp.avatar.pose import GAMMA, SurfaceLight
 from oasis_warp.avatar.sky import sky_mesh, studio_light
 from oasis_warp.core import surface
@@ -84,8 +85,9 @@ def page_facts(
     poses = {"photo": avatar.source_pose.angles.cpu()}
     poses |= {name: avatar.held(name).angles.cpu() for name in POSE_NAMES}
     lights = {} if parts.light is None else {"photo": parts.light}
-    studio = avatar.in_light(studio_light()).parts.light
-    assert studio is not None, "in_light gives one"
+    in_studio = avatar.in_light(studio_light()).parts
+    studio, folds = in_studio.light, in_studio.folds
+    assert studio is not None and folds is not None, "in_light gives them"
     lights["studio"] = studio
     begin = poses["photo"] if angles is None else angles.cpu()
     *reached, at_start = _reached(avatar, [*poses.values(), begin])
@@ -104,6 +106,7 @@ def page_facts(
         "motions": [{"label": "Through poses", "seconds": WALK_SECONDS, "frames": [_flat(frame) for frame in walk]}],
         "joints": joint_sliders(parts.hand),
         "lights": {name: _light_facts(light) for name, light in lights.items()},
+        "folds": {"straight": _flat(folds.straight), "photo": _flat(folds.photo)},
         "photoView": None if studio.photo_view is None else _flat(studio.photo_view),
         "still": sky_mesh(torch.device("cpu")).still,
         "orbitMargin": ORBIT_MARGIN,
@@ -117,7 +120,7 @@ def page_facts(
         },
         "hasInvented": avatar.invented is not None,
     }
-    return facts, _arrays(avatar, studio if parts.light is None else parts.light)
+    return facts, _arrays(avatar, studio if parts.light is None else parts.light, folds)
 
 
 def splat_facts(gaussians: Gaussians) -> tuple[dict[str, Any], dict[str, np.ndarray | Packed]]:
@@ -200,8 +203,8 @@ def _middle(vertices: Float[Tensor, "N 3"]) -> Float[Tensor, "3"]:
 
 
 @torch.no_grad()
-def _arrays(avatar: Avatar, light: SurfaceLight) -> dict[str, np.ndarray | Packed]:
-    hand, rest, gaussians, own_light = avatar.parts
+def _arrays(avatar: Avatar, light: SurfaceLight, folds: Folds) -> dict[str, np.ndarray | Packed]:
+    hand, rest, gaussians, own_light, _ = avatar.parts
     normals = surface.vertex_normals(avatar.rest.vertices, avatar.hand.faces)
     sky, mesh = sky_directions(torch.device("cpu")), sky_mesh(torch.device("cpu"))
     even = torch.ones(3) if own_light is None else own_light.light.even.cpu() ** (1 / GAMMA)
@@ -241,6 +244,9 @@ def _arrays(avatar: Avatar, light: SurfaceLight) -> dict[str, np.ndarray | Packe
         "skyAxes": _numpy(sky.axes, "f4"),
         "skyWeights": _numpy(sky.weights, "f4"),
     }
+    dark = torch.zeros_like(gaussians.colors).index_copy(0, folds.index, folds.darkness)
+    joint = torch.zeros_like(gaussians.opacities).index_copy(0, folds.index, folds.joint.to(gaussians.opacities))
+    arrays |= {"folds": _pack(dark, "u1", 1.0), "foldJoint": _numpy(joint, "u1")}
     if light.light.facing is not None:
         arrays["facing"] = _pack(light.light.facing, "i2", 1.0)
     if light.light.shade is not None:

@@ -9,6 +9,7 @@ const SAME_VIEW = Math.cos((10 * Math.PI) / 180), OTHER_VIEW = Math.cos((35 * Ma
 const SAME_SKY = 0.08, OTHER_SKY = 0.25; // changes of the share of the sky that skin sees, as in avatar/pose.py
 const SAME_BESIDE = 0.02, OTHER_BESIDE = 0.08; // the same where the photo is in doubt
 const IN_HOLLOWS = [1, 1.2, 1.35], LEAST_LIGHT = [0.05, 0.02, 0.01]; // of light in hollows, as in avatar/sky.py
+const CLOSED = (15 * Math.PI) / 180, OPENED = (75 * Math.PI) / 180; // flexions between which folds open, as in avatar/folds.py
 const WEAK = 0.3, DEEP = 0.6; // differences of shade from 1, up to which it is the skin's own, and from which it is not
 const MAP_SEEN = [0.36, 0.6, 0.57], MAP_INVENTED = [0.89, 0.55, 0.28], MAP_SKIN = 0.35; // colours of the map; share of skin in it
 
@@ -17,10 +18,20 @@ function makeShading(body, { count }) {
   return {
     normals: new Float32Array(3 * n), factors: new Float32Array(4 * n), change: new Float32Array(n), nearby: new Float32Array(n),
     deep: new Float32Array(n), colors: new Uint32Array(count), sky: makeSky(body),
+    opened: new Float32Array(2 * (body.nBones - 1)), // of each joint, the share of seen folds that is open, and of painted ones
   };
 }
 
 const between = (x, low, high) => Math.min(Math.max((x - low) / (high - low), 0), 1);
+
+// How far the folds over each joint are open: beyond the flexion in the photo, and for painted ones beyond a straight finger.
+function openFolds(body, { opened }, angles) {
+  const { straight, photo } = body.data.folds;
+  for (let j = 0; j < straight.length; j++) {
+    opened[2 * j] = between(angles[3 * j] - photo[j], CLOSED, OPENED);
+    opened[2 * j + 1] = between(angles[3 * j] - straight[j], CLOSED, OPENED);
+  }
+}
 
 // What the posed hand hides of a light, and what no longer hides the sky as in the photo.
 function hideLight(body, { normals, sky, change, nearby }, { harmonics, albedo, seen }, hurry) {
@@ -85,17 +96,23 @@ function lightVertex({ harmonics: h, limits }, bounce, x, y, z, exposure, factor
 
 // Colours and opacities of all Gaussians, a byte each, into shading.colors. `light` is null for even light.
 function colorGaussians(body, gaussians, shading, light) {
-  const { colors: own, fineShade, even } = body.data.arrays, { count, corners, shares, heaviest, shown, opacities } = gaussians;
-  const { factors, colors, deep } = shading;
+  const { colors: own, fineShade, even, folds, foldJoint, invented } = body.data.arrays, { count, corners, shares, heaviest, shown, opacities } = gaussians;
+  const { factors, colors, deep, opened } = shading;
   for (let i = 0; i < count; i++) {
     if (!shown[heaviest[i]]) continue;
     const a = 3 * i, p = shares[a], q = shares[a + 1], r = shares[a + 2];
     const u = 4 * corners[a], v = 4 * corners[a + 1], w = 4 * corners[a + 2];
-    let stays = 0;
+    const weak = light ? p * factors[u + 3] + q * factors[v + 3] + r * factors[w + 3] : 1;
+    let stays = 0, open = 0;
+    if (light && folds[a + 1]) {
+      const painted = invented ? p * invented[corners[a]] + q * invented[corners[a + 1]] + r * invented[corners[a + 2]] : 0;
+      const j = 2 * foldJoint[i];
+      open = (opened[j] + painted * (opened[j + 1] - opened[j])) * (1 - weak);
+    }
     if (light && fineShade) {
       const red = Math.abs(fineShade[a] - 1), green = Math.abs(fineShade[a + 1] - 1), blue = Math.abs(fineShade[a + 2] - 1);
       const share = between(Math.max(red, green, blue), WEAK, DEEP);
-      stays = (1 - share) * (p * factors[u + 3] + q * factors[v + 3] + r * factors[w + 3]) +
+      stays = (1 - share) * weak +
         share * (p * deep[corners[a]] + q * deep[corners[a + 1]] + r * deep[corners[a + 2]]);
     }
     let packed = Math.round(255 * opacities[i]) << 24;
@@ -104,6 +121,7 @@ function colorGaussians(body, gaussians, shading, light) {
       if (light) {
         factor = p * factors[u + c] + q * factors[v + c] + r * factors[w + c];
         if (stays) factor *= 1 + stays * (fineShade[a + c] - 1);
+        if (open) factor *= Math.exp(open * folds[a + c]);
       }
       packed |= Math.round(255 * Math.min(Math.max(own[a + c] * factor, 0), 1)) << (8 * c);
     }

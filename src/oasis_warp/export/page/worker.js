@@ -21,6 +21,7 @@ function poseHand({ body, shading }, angles) {
   rotateFaces(body);
   rotateVertices(body);
   turnWithVertices(body.quats, body.data.arrays.normals, shading.normals);
+  openFolds(body, shading, angles);
 }
 
 // In even light and on the map colours do not depend on the pose.

@@ -1,0 +1,102 @@
+import pytest
+import torch
+from synthetic import avatar_of, crop_of
+
+from oasis_warp.avatar import folds as found
+from oasis_warp.avatar.appearance import label_regions
+from oasis_warp.avatar.pose import in_even_light, posed_lighting
+from oasis_warp.core.types import HandLight, HandPose
+from oasis_warp.hand_avatar import Avatar
+
+DARK = 0.8
+"""Factor of the colours of folds."""
+
+
+@pytest.fixture(scope="module")
+def wrinkled(hand):
+    """An avatar of straight fingers with dark folds, in the photo's light."""
+    knuckle = label_regions(hand).knuckle[:, None]
+    colors = 0.5 * (1 - (1 - DARK) * (knuckle > 0.5).float()).expand(-1, 3)
+    crop, truth, pose = crop_of(hand, colors, size=64, pose_name="open")
+    n = len(hand.template)
+    light = HandLight(
+        torch.eye(9, 3)[:, :1].expand(9, 3).clone(), torch.tensor([[0.2] * 3, [1.6] * 3]), torch.ones(3),
+        shade=torch.ones(n, 3), facing=crop.posed.vertices.new_tensor([0.0, 0.0, -1.0]).expand(n, 3).clone(),
+    )  # fmt: skip
+    return avatar_of(hand, truth, pose, crop.camera, light)
+
+
+def colors_of_joint(avatar, angles, name):
+    """Mean colour of the darkest folds of a joint in a pose."""
+    folds = found.find_folds(avatar.hand, avatar.gaussians, avatar.invented, avatar.source_pose.angles)
+    of_joint = (folds.joint == avatar.hand.joint_names.index(name) - 1) & (folds.darkness.amin(1) > 0.15)
+    assert int(of_joint.sum()) > 20
+    posed = avatar.pose(avatar.source_pose._replace(angles=angles))
+    return float(posed.colors[..., folds.index[of_joint], :].mean())
+
+
+def bent(avatar, name, flexion):
+    angles = avatar.source_pose.angles.clone()
+    angles[avatar.hand.joint_names.index(name) - 1, 0] += flexion
+    return angles
+
+
+def painted(avatar):
+    """The same, all of it painted."""
+    return Avatar(
+        side=avatar.side, shape=avatar.shape, surface_offsets=avatar.surface_offsets, gaussians=avatar.gaussians,
+        source_pose=avatar.source_pose, source_camera=avatar.source_camera, light=avatar.light,
+        invented=torch.ones(len(avatar.hand.template)), hand=avatar.hand,
+    )  # fmt: skip
+
+
+def test_dark_folds_open_when_their_joint_bends_and_no_others(wrinkled):
+    """Folds that stayed on bent fingers looked like soot."""
+    for name, other in (("index2", "middle2"), ("ring3", "ring2")):
+        straight = wrinkled.source_pose.angles
+        curled = bent(wrinkled, name, 1.6)
+        assert colors_of_joint(wrinkled, curled, name) / colors_of_joint(wrinkled, straight, name) > 1.1
+        assert colors_of_joint(wrinkled, curled, other) == pytest.approx(
+            colors_of_joint(wrinkled, straight, other), rel=0.02
+        )
+
+
+def test_what_the_photo_shows_of_bent_fingers_stays_and_painted_folds_are_those_of_straight_ones(wrinkled):
+    curled = bent(wrinkled, "index2", 1.6)
+    of_fist = Avatar(
+        side=wrinkled.side, shape=wrinkled.shape, surface_offsets=wrinkled.surface_offsets,
+        gaussians=wrinkled.gaussians, source_pose=wrinkled.source_pose._replace(angles=curled),
+        source_camera=wrinkled.source_camera, light=wrinkled.light._replace(facing=None, shade=None),
+    )  # fmt: skip
+    folds = found.find_folds(of_fist.hand, of_fist.gaussians, None, curled)
+    assert float(found.open_folds(folds, curled).logs.abs().max()) == 0
+    opened = found.open_folds(folds._replace(painted=torch.ones_like(folds.painted)), curled).logs
+    assert float(opened.amax()) > 0.1
+    assert colors_of_joint(painted(of_fist), curled, "index2") > 1.1 * colors_of_joint(of_fist, curled, "index2")
+
+
+def test_many_poses_at_once_open_the_same_and_the_photos_own_view_does_not_change(wrinkled):
+    curled = bent(wrinkled, "middle2", 1.2)
+    alone = wrinkled.pose(wrinkled.source_pose._replace(angles=curled)).colors
+    source = wrinkled.source_pose
+    angles = torch.stack([source.angles, curled])
+    many = wrinkled.pose(HandPose(angles, source.orientation.expand(2, 3, 3), source.translation.expand(2, 3)))
+    torch.testing.assert_close(many.colors[1], alone)
+    folds = found.find_folds(wrinkled.hand, wrinkled.gaussians, torch.ones(len(wrinkled.hand.template)), source.angles)
+    in_photo = wrinkled.with_looks(wrinkled.gaussians, wrinkled.light._replace(facing=wrinkled_normals(wrinkled)))
+    in_photo._folds = folds._replace(straight=folds.straight - 3)  # all are open but for the photo's shade
+    plain = wrinkled.with_looks(in_photo.gaussians, in_photo.light)
+    plain._folds = None
+    torch.testing.assert_close(in_photo.pose(source).colors, plain.pose(source).colors)
+
+
+def wrinkled_normals(avatar):
+    """Where its vertices face in the photo."""
+    return posed_lighting(avatar.rest.vertices, avatar._photo_surface(), avatar.hand.faces, avatar.light).normals
+
+
+def test_even_light_leaves_them_as_they_are(wrinkled):
+    even = wrinkled.with_looks(in_even_light(wrinkled.gaussians, wrinkled.light), None)
+    assert even.parts.folds is None
+    posed = even.pose(even.source_pose._replace(angles=bent(even, "index2", 1.6)))
+    assert torch.equal(posed.colors, even.gaussians.colors)
