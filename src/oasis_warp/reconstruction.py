@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.adaptation.adapt import Adaptation, adapt, add_detail
+from oasis_warp.adaptation.photo_view import match_photo
 from oasis_warp.adaptation.rim_shade import limit_shade, match_rim
 from oasis_warp.adaptation.smooth_shade import spread_shade
 from oasis_warp.adaptation.unseen_skin import paint_unseen
@@ -243,7 +244,7 @@ def _run(
         )  # fmt: skip
     with stage("detail"):
         adaptation = add_detail(hand, adaptation, close, close_scales, COARSE_SIZE, progress)
-    adaptation, invented = _finish(hand, adaptation, crops, config, stage)
+    adaptation, invented = _finish(hand, adaptation, crops, close, config, stage)
     gaussians, light = adaptation.gaussians, adaptation.light
     avatar = make_avatar(fits[0], surfaces.shared, crops[0], gaussians, light, invented, hand=hand)
     with stage("quality"):
@@ -285,9 +286,13 @@ def _fit(
 
 
 def _finish(
-    hand: HandModel, adaptation: Adaptation, crops: Sequence[HandCrop], config: ReconstructConfig, stage: Stage
-) -> tuple[Adaptation, Float[Tensor, "V"] | None]:
-    """Paint what no photo shows and close the wrist: the adaptation, and where skin was painted."""
+    hand: HandModel, adaptation: Adaptation, crops: Sequence[HandCrop], close: Sequence[HandCrop],
+    config: ReconstructConfig, stage: Stage,
+) -> tuple[Adaptation, Float[Tensor, "V"] | None]:  # fmt: skip
+    """Paint what no photo shows and close the wrist: the adaptation, and where skin was painted.
+
+    A single photo is also matched in its own view, at the size of its detail: several would undo each other's.
+    """
     gaussians, invented, first = adaptation.gaussians, None, crops[0]
     if config.unseen == "painted":
         with stage("painting"):
@@ -299,6 +304,9 @@ def _finish(
         gaussians, spread = spread_shade(hand, gaussians, first, lights[0])
         lights = (match_rim(hand, gaussians, first, spread), *lights[1:])
         lights = tuple(end_shade(hand, light, rest) for light in lights)
+        if len(close) == 1:
+            with stage("detail"):
+                gaussians = match_photo(hand, gaussians, close[0], lights[0])
     return adaptation._replace(gaussians=close_wrist(hand, gaussians, rest), lights=lights), invented
 
 
