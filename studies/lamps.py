@@ -38,7 +38,7 @@ class Options(AvatarOptions):
 
     photos: Path = PHOTOS / "same_hand"
     """Folder of photos; those of left hands are left out."""
-    directions: int = 120
+    directions: int = 60
     """Directions of the lamp, evenly over the sphere; the best one of each photo counts."""
 
 
