@@ -38,6 +38,8 @@ class Options(AvatarOptions):
 
     photos: Path = PHOTOS / "same_hand"
     """Folder of photos; those of left hands are left out."""
+    every: int = 2
+    """Every so manieth photo is measured."""
     directions: int = 60
     """Directions of the lamp, evenly over the sphere; the best one of each photo counts."""
 
@@ -105,7 +107,8 @@ def measure_photo(path: Path, options: Options) -> list[Row]:
 
 def run(options: Options) -> list[Row]:
     """Measure every photo."""
-    cases = {path.relative_to(options.photos).as_posix(): (path, options) for path in photos_below(options.photos)}
+    paths = photos_below(options.photos)[:: options.every]
+    cases = {path.relative_to(options.photos).as_posix(): (path, options) for path in paths}
     return measured("lamps", cases, measure_photo, options)
 
 

@@ -48,6 +48,7 @@ def test_what_the_skin_does_not_explain_is_in_the_photos_view_and_is_shade(hand,
 def test_hidden_skin_and_the_wrist_keep_their_shade(hand, scene):
     crop, gaussians, light = scene
     shade = match_photo(hand, gaussians, crop, light).shade
+    assert shade is not None
     hidden = distance_to_seen(hand, crop, gaussians) > 0.01
     assert int(hidden.sum()) > 1000 and float((shade[hidden] - 1).abs().quantile(0.99)) < 0.02
     to_rim = torch.cdist(crop.rest.vertices, crop.rest.vertices[hand.rim]).amin(1)[:, None]
