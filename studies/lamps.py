@@ -29,6 +29,8 @@ DISTANCE, BUFFER = 40.0, 192
 """Distance of a lamp over the hand's radius, and side of its depth buffer [px]."""
 MARGIN = 0.003
 """Depth behind the nearest surface up to which skin is lit [m]."""
+LEAST = 1e-6
+"""Added to the squares of the terms, whose sum is about 1."""
 LAMPS = ("a lamp without shadows", "a lamp with shadows")
 
 
@@ -38,7 +40,7 @@ class Options(AvatarOptions):
 
     photos: Path = PHOTOS / "same_hand"
     """Folder of photos; those of left hands are left out."""
-    every: int = 2
+    every: int = 4
     """Every so manieth photo is measured."""
     directions: int = 60
     """Directions of the lamp, evenly over the sphere; the best one of each photo counts."""
@@ -72,7 +74,8 @@ def lit_share(posed: PosedHand, faces: Tensor, directions: Float[Tensor, "D 3"])
 def error_left(terms: Float[Tensor, "3 V K"], goal: Float[Tensor, "3 V"], weight: Float[Tensor, "V"]) -> float:
     """Sum of squares that the best combination of terms leaves; infinite for a lamp that takes light."""
     weighted = terms * weight[:, None]
-    found = torch.linalg.solve(weighted.mT @ terms, (weighted.mT @ goal[..., None]))
+    normal = weighted.mT @ terms + LEAST * torch.eye(terms.shape[-1])  # a lamp may light nothing that is seen
+    found = torch.linalg.solve(normal, weighted.mT @ goal[..., None])
     left = float((weight * (goal - (terms @ found)[..., 0]).square()).sum())
     return left if terms.shape[-1] == 9 or float(found[:, 9:].mean()) > 0 else math.inf
 
