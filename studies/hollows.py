@@ -5,16 +5,21 @@ Fills docs/avatar.md (hollows).
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from oasis_warp.avatar.observation import observe
+from oasis_warp.avatar.observation import Observation, observe
 from oasis_warp.avatar.pose import GAMMA, posed_lighting
 from oasis_warp.avatar.sky import arriving, harmonic_basis
-from oasis_warp.core.types import HandCrop
+from oasis_warp.core.config import ReconstructConfig
+from oasis_warp.core.types import HandCrop, HandLight, PosedHand
 from oasis_warp.data.photo import read_photo
 from oasis_warp.evaluation import views
+from oasis_warp.hand_avatar import Avatar
 from oasis_warp.reconstruction import reconstruct
 from studies.harness import AvatarOptions, Row, measured
 from studies.inputs import PHOTOS, photos_below
@@ -37,23 +42,46 @@ class Options(AvatarOptions):
     """Folder of photos; those of left hands are left out."""
 
 
-def measure_photo(path: Path, options: Options) -> list[Row]:
-    """A row for each bin of the share of the sky: how bright skin is beyond the light, over that of open skin."""
-    avatar = reconstruct(read_photo(path), options.config()).avatar
+class SeenSkin(NamedTuple):
+    """What the picture of a right hand shows from its photo's camera, and the light on it."""
+
+    avatar: Avatar
+    light: HandLight
+    albedo: Float[Tensor, "3"]
+    """Of `light`."""
+    posed: PosedHand
+    seen: Observation
+    normals: Float[Tensor, "V 3"]
+    exposure: Float[Tensor, "V 4"]
+    """As `sky.exposure`."""
+
+
+def seen_skin(path: Path, config: ReconstructConfig) -> SeenSkin | None:
+    """The skin that a photo shows; None of a left hand."""
+    avatar = reconstruct(read_photo(path), config).avatar
     light = avatar.light
     if avatar.side == "left" or light is None or light.albedo is None:
-        return []
+        return None
     photo = views.views_of(avatar)[0]
     drawn, posed, faces = views.draw(avatar, photo), avatar.mesh(photo.pose), avatar.hand.faces
     above = torch.ones_like(drawn.alpha.squeeze(-1))
     crop = HandCrop(drawn.image.clamp(0, 1), drawn.alpha.squeeze(-1), above, photo.camera, avatar.rest, posed)
     seen, on = observe(avatar.hand, crop), posed_lighting(avatar.rest.vertices, posed.vertices, faces, light)
     assert on.exposure is not None, "there is an albedo"
+    return SeenSkin(avatar, light, light.albedo, posed, seen, on.normals, on.exposure)
+
+
+def measure_photo(path: Path, options: Options) -> list[Row]:
+    """A row for each bin of the share of the sky: how bright skin is beyond the light, over that of open skin."""
+    found = seen_skin(path, options.config())
+    if found is None:
+        return []
+    avatar, light, albedo, _, seen, normals, exposure = found
     least, most = light.limits.unbind(0)
-    received = harmonic_basis(on.normals, len(light.harmonics)) @ light.harmonics
+    received = harmonic_basis(normals, len(light.harmonics)) @ light.harmonics
     beyond = (seen.colors.clamp_min(1e-3) ** GAMMA / torch.minimum(torch.maximum(received, least), most)).log()
     good = (seen.confidence > SURE) & (avatar.hand.nail < 0.1)
-    sky, beyond = on.exposure[good, 0], beyond[good]
+    sky, beyond = exposure[good, 0], beyond[good]
     if int((sky > OPEN).sum()) < FEWEST:
         return []
     beyond = beyond - beyond[sky > OPEN].median(0).values
@@ -63,7 +91,7 @@ def measure_photo(path: Path, options: Options) -> list[Row]:
         if bool(inside.any()):
             logarithms = beyond[inside].median(0).values.tolist()
             rows.append({"bin": k, "vertices": int(inside.sum()), "sky": float(sky[inside].mean()),
-                         "beyond": logarithms, "albedo": light.albedo.tolist()})  # fmt: skip
+                         "beyond": logarithms, "albedo": albedo.tolist()})  # fmt: skip
     return rows
 
 

@@ -12,16 +12,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.avatar.anchors import vertex_colors
-from oasis_warp.avatar.observation import observe
-from oasis_warp.avatar.pose import GAMMA, posed_lighting
+from oasis_warp.avatar.pose import GAMMA
 from oasis_warp.avatar.sky import arriving, harmonic_basis
-from oasis_warp.core.types import HandCrop, PosedHand
-from oasis_warp.data.photo import read_photo
-from oasis_warp.evaluation import views
+from oasis_warp.core.types import PosedHand
 from oasis_warp.ops import depth_visibility
-from oasis_warp.reconstruction import reconstruct
 from oasis_warp.synthetic.illumination import look_at
+from oasis_warp.synthetic.view_and_light import sphere
 from studies.harness import AvatarOptions, Row, measured
+from studies.hollows import seen_skin
 from studies.inputs import PHOTOS, photos_below
 from studies.tables import Column, Section, complete, percentiles, table
 
@@ -44,14 +42,6 @@ class Options(AvatarOptions):
     """Every so manieth photo is measured."""
     directions: int = 60
     """Directions of the lamp, evenly over the sphere; the best one of each photo counts."""
-
-
-def evenly(count: int) -> Float[Tensor, "D 3"]:
-    """Directions on a spiral over the sphere."""
-    k = torch.arange(count, dtype=torch.float64) + 0.5
-    z, turn = 1 - 2 * k / count, math.pi * (1 + math.sqrt(5)) * k
-    radius = (1 - z * z).sqrt()
-    return torch.stack([radius * turn.cos(), radius * turn.sin(), z], 1).float()
 
 
 def lit_share(posed: PosedHand, faces: Tensor, directions: Float[Tensor, "D 3"]) -> Float[Tensor, "D V"]:
@@ -82,26 +72,21 @@ def error_left(terms: Float[Tensor, "3 V K"], goal: Float[Tensor, "3 V"], weight
 
 def measure_photo(path: Path, options: Options) -> list[Row]:
     """What is left of the squared error of harmonics with the best lamp."""
-    avatar = reconstruct(read_photo(path), options.config()).avatar
-    light = avatar.light
-    if avatar.side == "left" or light is None or light.albedo is None:
+    found = seen_skin(path, options.config())
+    if found is None:
         return []
-    photo, faces = views.views_of(avatar)[0], avatar.hand.faces
-    drawn, posed = views.draw(avatar, photo), avatar.mesh(photo.pose)
-    alpha = drawn.alpha.squeeze(-1)
-    crop = HandCrop(drawn.image.clamp(0, 1), alpha, torch.ones_like(alpha), photo.camera, avatar.rest, posed)
-    seen, on = observe(avatar.hand, crop), posed_lighting(avatar.rest.vertices, posed.vertices, faces, light)
-    assert on.exposure is not None, "there is an albedo"
+    avatar, _, mean_albedo, posed, seen, normals, exposure = found
     albedo = vertex_colors(avatar.gaussians, len(posed.vertices)) ** GAMMA
     scale = (seen.confidence[:, None] * albedo.square()).sum(0).sqrt()
     goal = (seen.colors.clamp(0, 1) ** GAMMA / scale).T
-    sky = albedo * arriving(on.exposure[..., 1:], light.albedo) / scale
-    harmonics = harmonic_basis(on.normals, 9) * sky.T[..., None]
+    sky = albedo * arriving(exposure[..., 1:], mean_albedo) / scale
+    harmonics = harmonic_basis(normals, 9) * sky.T[..., None]
     alone = error_left(harmonics, goal, seen.confidence)
-    directions = evenly(options.directions)
-    facing = (on.normals @ directions.T).clamp_min(0).T
+    directions = torch.from_numpy(sphere(options.directions)).to(normals)
+    facing = (normals @ directions.T).clamp_min(0).T
     row: Row = {"harmonics": alone}
-    for name, share in zip(LAMPS, (torch.ones_like(facing), lit_share(posed, faces, directions)), strict=True):
+    shares = torch.ones_like(facing), lit_share(posed, avatar.hand.faces, directions)
+    for name, share in zip(LAMPS, shares, strict=True):
         lamps = (facing * share)[..., None] * albedo / scale
         errors = [error_left(torch.cat([harmonics, lamp.T[..., None]], 2), goal, seen.confidence) for lamp in lamps]
         row[name] = min(*errors, alone) / alone

@@ -1,12 +1,11 @@
 """The photo's own view as the photo shows it, by the shade that fades everywhere else."""
 
 import torch
-from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
+from oasis_warp.adaptation.sharpen import lit_as_photo
 from oasis_warp.avatar.anchors import rim_fade, vertex_to_gaussians
-from oasis_warp.avatar.observation import inner_mask
-from oasis_warp.avatar.pose import pose_gaussians, posed_lighting, shading_factors
+from oasis_warp.avatar.observation import faded_in
+from oasis_warp.avatar.pose import pose_gaussians, posed_lighting
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandLight
 from oasis_warp.ops import blend_colors
@@ -47,26 +46,17 @@ def match_photo(
         return gaussians
     rest, posed = crop.rest.vertices, crop.posed.vertices
     faces = hand.faces.to(rest.device)
-    on = posed_lighting(rest, posed, faces, light)
-    lit = (gaussians.colors * shading_factors(gaussians, faces, light, on)).clamp(0, 1)
-    shown = pose_gaussians(gaussians._replace(colors=lit, shade=None), faces, rest, posed)
-    weights = view_weights(shown, crop.camera)
-    counts = _inside(crop.mask)
+    lit = lit_as_photo(gaussians, faces, light, posed_lighting(rest, posed, faces, light))
+    weights = view_weights(pose_gaussians(lit, faces, rest, posed), crop.camera)
+    counts = faded_in(crop.mask, BORDER)[..., None]
     total = weights.transpose @ counts.view(-1, 1)
     known = total > FEWEST
-    goal, colors = crop.image * weights.alphas, lit
+    goal, colors = crop.image * weights.alphas, lit.colors
     for _ in range(ROUNDS):
         missing = (goal - blend_colors(weights, colors)) * counts
         step = (weights.transpose @ missing.view(-1, 3)) / total.clamp_min(FEWEST)
         colors = (colors + OVERSHOOT * step * known).clamp(0, 1)
     fade = rim_fade(rest[None], hand.rim.to(rest.device), WRIST, WRIST)[0, :, None]
-    change = (colors.clamp_min(MIN_COLOR) / lit.clamp_min(MIN_COLOR)).log().clamp(-MOST, MOST)
+    change = (colors.clamp_min(MIN_COLOR) / lit.colors.clamp_min(MIN_COLOR)).log().clamp(-MOST, MOST)
     change = change * vertex_to_gaussians(fade, faces, gaussians)
     return gaussians._replace(shade=gaussians.shade * change.exp())
-
-
-def _inside(mask: Tensor) -> Tensor:
-    """How much each pixel counts, [S, S, 1]: 0 up to `BORDER` from the mask's border, then more and more."""
-    border = max(1, round(BORDER * len(mask)))
-    inner = inner_mask(mask, 2 * border)
-    return avg_pool2d(inner[None, None], 2 * border + 1, stride=1, padding=border)[0, 0, ..., None]

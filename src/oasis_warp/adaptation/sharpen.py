@@ -23,7 +23,7 @@ from oasis_warp.adaptation.reprojection import (
 )
 from oasis_warp.avatar.anchors import RIM_FADE, vertex_to_gaussians
 from oasis_warp.avatar.densify import densify, parts_for_spacing
-from oasis_warp.avatar.observation import inner_mask
+from oasis_warp.avatar.observation import faded_in
 from oasis_warp.avatar.pose import (
     Lighting,
     pose_gaussians,
@@ -113,12 +113,12 @@ def sharpen(
     fading = with_neighbours(fading[faces].any(1), faces, len(rest))
     sources = [_source(e, faces, fading, own) for e, own in zip(crops, shares, strict=True)]
     on = None if light is None else posed_lighting(rest, sources[0].posed, faces, light)
-    old = [pose_gaussians(_lit(gaussians, faces, light, on), faces, rest, source.posed) for source in sources]
+    old = [pose_gaussians(lit_as_photo(gaussians, faces, light, on), faces, rest, source.posed) for source in sources]
     around, parts = _parts(rest, faces, sources, old)
     if not bool(around.any()):
         return SharpenResult(gaussians, 0, ())
     dense, changed, n_new = densify(gaussians, rest, faces, parts, thickness=THICKNESS)
-    shown = _lit(dense, faces, light, on)
+    shown = lit_as_photo(dense, faces, light, on)
     new = [pose_gaussians(shown, faces, rest, source.posed) for source in sources]
     start = overlay_pictures(shown.colors[changed], sources, [there.means[changed] for there in new])
     colors = shown.colors.masked_scatter(changed[:, None], start)
@@ -152,7 +152,7 @@ def _parts(
     return around, torch.where(around, parts_for_spacing(rest, faces, spacing).clamp_min(2), 1)
 
 
-def _lit(
+def lit_as_photo(
     gaussians: CanonicalGaussians, faces: Int[Tensor, "F 3"], light: HandLight | None, on: Lighting | None
 ) -> CanonicalGaussians:
     """With the colours that photos show, in `light` if there is one."""
@@ -166,7 +166,7 @@ def _source(
     crop: HandCrop, faces: Tensor, fading: Bool[Tensor, "F"], share: Float[Tensor, "V"]
 ) -> Source:
     """The photo on its surface, weighted by `share`, and by 0 on `fading` faces."""
-    posed, canvas = crop.posed.vertices, Canvas(crop.image, _faded_in(crop.mask), crop.camera)
+    posed, canvas = crop.posed.vertices, Canvas(crop.image, faded_in(crop.mask, RIM), crop.camera)
     seen = map_surface(posed, faces, canvas, FACING)
     ids = seen.faces.clamp_min(0)
     trust = torch.where(fading[ids], 0, (share[faces[ids]] * seen.barycentrics).sum(-1))
@@ -190,13 +190,6 @@ def _views(
             goal = goal * weights.alphas - blend_colors(weights, fixed)
             views.append(TargetView(weights, goal, weight * scale**2))
     return views
-
-
-def _faded_in(mask: Float[Tensor, "S S"]) -> Float[Tensor, "S S"]:
-    """Share of each pixel that is surely hand, growing from the border over a width of `RIM`."""
-    rim = max(1, round(RIM * len(mask)))
-    inner = inner_mask(mask, 2 * rim)
-    return avg_pool2d(inner[None, None], 2 * rim + 1, stride=1, padding=rim)[0, 0]
 
 
 def _wanted_spacing(source: Source, drawn: Float[Tensor, "S S 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "F"]:

@@ -185,8 +185,8 @@ def relief_shade(hand: HandModel, seed: int) -> Float[Tensor, "V 3"]:
 FLUSH, FLUSH_ON_BACK = (-0.018, -0.042, -0.041), 0.3
 """What a standard deviation of the blood in the skin of a palm adds to the logarithms of colours, 28 % of its mean in
 the model of `avatar.appearance.skin_color`, and the share of this on a back. Set by eye on photos of same_hand: twice
-as much has blotches. With .8 on backs, which had green and yellow patches, a blind grader preferred this on 11 of 11
-hands of tests/data/photos."""
+as much has blotches. With .8 on backs, which had green and yellow patches, a blind grader preferred this on 11 of 14
+hands of tests/data/photos, with 3 ties."""
 FLUSH_PASSES = 6, 25
 """Smoothings of white noise over the mesh that give the fine and the coarse blotches of blood, 5 and 12 mm."""
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import grid_sample, max_pool2d, normalize
+from torch.nn.functional import avg_pool2d, grid_sample, max_pool2d, normalize
 
 from oasis_warp.core import surface
 from oasis_warp.core.camera import camera_center
@@ -114,6 +114,13 @@ def inner_mask(mask: Float[Tensor, "*B H W"], pixels: int = RIM_PIXELS) -> Float
     """The mask without its outermost `pixels`."""
     planes = -mask.reshape(-1, 1, *mask.shape[-2:])
     return -max_pool2d(planes, 2 * pixels + 1, stride=1, padding=pixels).view(mask.shape)
+
+
+def faded_in(mask: Float[Tensor, "S S"], border: float) -> Float[Tensor, "S S"]:
+    """Share of each pixel that is surely hand; it grows from the mask's border over a width of `border` sides."""
+    rim = max(1, round(border * len(mask)))
+    inner = inner_mask(mask, 2 * rim)
+    return avg_pool2d(inner[None, None], 2 * rim + 1, stride=1, padding=rim)[0, 0]
 
 
 def project_batch(

@@ -93,8 +93,10 @@ class HandModel:
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, Tensor):
-                moved[field.name] = value.to(device=device, dtype=dtype if value.is_floating_point() else None)
-        return replace(self, **moved)
+                there = value.to(device=device, dtype=dtype if value.is_floating_point() else None)
+                if there is not value:
+                    moved[field.name] = there
+        return replace(self, **moved) if moved else self  # what is kept of a model is found again
 
 
 def finger_of(joint: Joints) -> Joints:

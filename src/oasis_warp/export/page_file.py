@@ -245,7 +245,7 @@ def _arrays(avatar: Avatar, light: SurfaceLight, folds: Folds) -> dict[str, np.n
         "skyWeights": _numpy(sky.weights, "f4"),
     }
     dark = torch.zeros_like(gaussians.colors).index_copy(0, folds.index, folds.darkness)
-    joint = torch.zeros_like(gaussians.opacities).index_copy(0, folds.index, folds.joint.to(gaussians.opacities))
+    joint = folds.joint.new_zeros(len(dark)).index_copy(0, folds.index, folds.joint)
     arrays |= {"folds": _pack(dark, "u1", 1.0), "foldJoint": _numpy(joint, "u1")}
     if light.light.facing is not None:
         arrays["facing"] = _pack(light.light.facing, "i2", 1.0)
