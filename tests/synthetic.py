@@ -33,9 +33,11 @@ def crop_of(hand, vertex_colors, size=96, **pose) -> tuple[HandCrop, CanonicalGa
 
 
 def avatar_of(hand, gaussians, pose, camera, light=None):
-    """A right hand of mean shape."""
+    """A right hand of mean shape, on the device of the camera."""
+    device = camera.K.device
     return Avatar(
-        side="right", shape=torch.zeros(len(hand.shape_names)), surface_offsets=torch.zeros_like(hand.template),
+        side="right", shape=torch.zeros(len(hand.shape_names), device=device),
+        surface_offsets=torch.zeros_like(hand.template, device=device),
         gaussians=gaussians, source_pose=pose, source_camera=camera, light=light,
         hand=hand,
     )  # fmt: skip

@@ -31,7 +31,7 @@ CASES = [
     pytest.param(name, pass_, backend, id=f"{name}-{pass_.replace(' + ', '_and_')}-{backend}")
     for name, operator in OPERATORS.items()
     for pass_ in operator.passes
-    for backend in speed.ways(operator, DEVICE)
+    for backend in speed.backends(operator, DEVICE)
 ]
 
 
@@ -58,7 +58,7 @@ def test_operator(benchmark, scenes, truths, name, pass_, backend):
     operator = OPERATORS[name]
     scene = scenes[0] if operator.scene is GaussianScene else scenes[1]
     truth = truths(name)
-    timed = timed_pass(operator, scene, speed.ways(operator, DEVICE)[backend], pass_, truth, THREADS)
+    timed = timed_pass(operator, scene, speed.backends(operator, DEVICE)[backend], pass_, truth, THREADS)
     benchmark.group = f"{name}, {pass_}"
 
     def call():

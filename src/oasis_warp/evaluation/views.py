@@ -127,7 +127,7 @@ def read_surface(
 
 def read_crop(crop: HandCrop) -> Surface:
     """What a photo's crop of `SIZE` shows, its interior that of mesh and mask together."""
-    hand = bundled_hand()
+    hand = bundled_hand().to(crop.image.device)
     seen = observe(hand, crop).confidence
     surface = read_surface(hand, crop.posed.vertices, crop.camera, seen, label_regions(hand).palm)
     mask = (inner_mask(crop.mask, RIM) > 0.5) & (crop.above_wrist > 0.5)

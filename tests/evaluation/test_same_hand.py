@@ -1,0 +1,31 @@
+"""An avatar compared with a photo of the same hand."""
+
+import pytest
+import torch
+from synthetic import avatar_of, crop_of
+
+from oasis_warp.avatar.appearance import label_regions, region_colors
+from oasis_warp.core.types import Camera, Render
+from oasis_warp.evaluation.band_energy import SIZE
+from oasis_warp.evaluation.same_hand import compare_with_photo
+
+
+def test_a_picture_equal_to_the_photo_is_free_of_error_on_any_device(hand, device):
+    crop, truth, pose = crop_of(hand, region_colors(label_regions(hand), 0.03), size=SIZE)
+    camera = Camera(crop.camera.viewmat.to(device), crop.camera.K.to(device), SIZE, SIZE)
+    crop = crop._replace(
+        **{name: getattr(crop, name).to(device) for name in ("image", "mask", "above_wrist")},
+        camera=camera, rest=moved(crop.rest, device), posed=moved(crop.posed, device),
+    )  # fmt: skip
+    pose = moved(pose, device)
+    avatar = avatar_of(hand, moved(truth, device), pose, camera)
+    score = compare_with_photo(avatar, Render(crop.image, crop.mask), crop, pose)
+    assert score.psnr > 60 and score.psnr_plain > 60
+    assert score.ssim_quarter == pytest.approx(1, abs=1e-5)
+    assert score.contrasts == pytest.approx([1, 1, 1, 1])
+    assert max(score.region_errors.values()) < 0.02
+
+
+def moved(parts, device):
+    """A tuple of tensors on another device."""
+    return type(parts)(*(part.to(device) if isinstance(part, torch.Tensor) else part for part in parts))
