@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from oasis_warp.data.photo import read_photo
-from oasis_warp.evaluation.methods import Method, method_name
+from oasis_warp.evaluation.methods import ONE_SHOT, Method, method_name
 from oasis_warp.evaluation.summary import (
     COLORS,
     GROUPS,
@@ -29,7 +29,7 @@ from oasis_warp.evaluation.summary import (
     with_values,
 )
 from studies.harness import Row, StudyOptions
-from studies.tables import markdown, section_of, write_jpeg
+from studies.tables import markdown, mean, section_of, write_jpeg
 
 FOLDERS = {"synthetic": "evaluation", "same-hand": "same_hand_photos"}
 FILES = tuple(f"{folder}/metrics.json" for folder in FOLDERS.values())
@@ -38,6 +38,10 @@ PICTURES = {"evaluation_sheet": "evaluation/sheet.png", "evaluation_attention": 
 """Pictures of docs/_static and where they come from."""
 ROWS_SHOWN = 1300
 """Rows of a picture that are shown [px]."""
+JUDGED = {"PSNR": ("psnr", 1), "SSIM": ("ssim_quarter", 1), "colours": ("error", -1)}
+"""Measures of a pair, and whether more or less is better."""
+MOST = 0.25
+"""Share of the pairs on which two priors differ most."""
 
 @dataclass(frozen=True, kw_only=True)
 class Options(StudyOptions):
@@ -116,9 +120,27 @@ def photos(found: dict[str, Any]) -> str:
     words = f"{rows[0]['pairs']} ordered pairs of {len(found['settings']['photos'])} sets, medians."
     if found["left_out"]:
         words += f" Photos left out: {len(found['left_out'])}."
+    words += f" {where_priors_differ(found['pairs'])}"
     shown = with_values(rows, PHOTOS)
     headings = ["method", *(column.heading for column in shown.values())]
     return f"{markdown(headings, [[name_of(row), *cells(row, shown)] for row in rows])}\n\n{words}"
+
+
+def where_priors_differ(pairs: list[Record]) -> str:
+    """How often one-shot is better with the learned prior than without, where the two differ most by a measure."""
+    ours, plain = (
+        {(row["hand"], row["source"], row["target"]): row for row in pairs
+         if (row["prior"], row["stage"]) == (prior, ONE_SHOT)}
+        for prior in ("learned", "mean")
+    )  # fmt: skip
+    parts = []
+    for name, (measure, sign) in JUDGED.items():
+        gains = sorted(
+            (sign * (row[measure] - plain[pair][measure]) for pair, row in ours.items() if measure in row), key=abs
+        )
+        most = gains[-max(1, round(len(gains) * MOST)) :]
+        parts.append(f"{mean(gain > 0 for gain in most):.0%} by {name}")
+    return f"Where learned and mean one-shot differ most (a quarter of the pairs), learned is better on {', '.join(parts)}."
 
 
 SECTIONS = (

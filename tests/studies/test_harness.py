@@ -340,3 +340,17 @@ def test_an_untrained_prior_has_the_gaussians_of_the_mean_hand(weights, hand):
     assert [float(cell) for cell in rows["on faces: largest share of a corner in a face's features"]] == [0.33] * 3
     low, middle, high = (float(cell) for cell in rows["on faces: largest deviation, mm"])
     assert 0.1 < low < middle < high < 2
+
+
+def test_priors_are_compared_where_they_differ_most():
+    """A pair without a measure, or a gain counted with the wrong sign, would make the share wrong."""
+    pairs = []
+    for k in range(8):  # on pairs 6 and 7 the two differ most; learned wins one of them by PSNR, both by colours
+        gain = {6: -3.0, 7: 4.0}.get(k, 0.1)
+        same = {"hand": "a", "source": str(k), "target": "t", "stage": "one_shot", "ssim_quarter": 0.5}
+        pairs.append({**same, "prior": "mean", "psnr": 20.0, "error": 0.1})
+        pairs.append({**same, "prior": "learned", "psnr": 20 + gain, "error": 0.1 - abs(gain) / 100})
+        pairs.append({**same, "prior": "learned", "stage": "raw", "psnr": 30.0, "error": 0.0})
+    del pairs[0]["error"], pairs[1]["error"]
+    said = evaluation.where_priors_differ(pairs)
+    assert said.endswith("learned is better on 50% by PSNR, 0% by SSIM, 100% by colours.")
