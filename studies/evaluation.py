@@ -140,7 +140,8 @@ def where_priors_differ(pairs: list[Record]) -> str:
         )
         most = gains[-max(1, round(len(gains) * MOST)) :]
         parts.append(f"{mean(gain > 0 for gain in most):.0%} by {name}")
-    return f"Where learned and mean one-shot differ most (a quarter of the pairs), learned is better on {', '.join(parts)}."
+    shares = ", ".join(parts)
+    return f"Where learned and mean one-shot differ most (a quarter of the pairs), learned is better on {shares}."
 
 
 SECTIONS = (
