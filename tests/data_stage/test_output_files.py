@@ -149,7 +149,11 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from oasis_warp.data.output_files import output_file, output_folder
-kind, place = sys.argv[1], Path(sys.argv[2])
+kind, place, *others = sys.argv[1:]
+while others and os.fork():  # a process for each
+    assert os.waitstatus_to_exitcode(os.wait()[1]) == -signal.SIGKILL
+    kind, place, *others = others
+place = Path(place)
 replace = os.replace
 def stop(source, final):
     if kind == "commit" and Path(final).name == "b.txt":
@@ -167,15 +171,14 @@ with (output_file if kind == "file" else output_folder)(place) as part:
 """
 
 
-def killed(kind: str, place: Path) -> None:
-    done = subprocess.run([sys.executable, "-c", KILLED, kind, str(place)], capture_output=True)
+def killed(*kinds_and_places: str | Path) -> None:
+    done = subprocess.run([sys.executable, "-c", KILLED, *map(str, kinds_and_places)], capture_output=True)
     assert done.returncode == -signal.SIGKILL, done.stderr
 
 
 def test_the_next_run_removes_what_a_killed_one_left(tmp_path):
     (tmp_path / "there").mkdir()
-    for kind, place in (("file", "x.png"), ("folder", "new"), ("folder", "there")):
-        killed(kind, tmp_path / place)
+    killed("file", tmp_path / "x.png", "folder", tmp_path / "new", "folder", tmp_path / "there")
     assert len([name for name in everything(tmp_path) if name.endswith((".part", ".part.png"))]) == 3
     (tmp_path / ".mine.png").touch()
     write_file(tmp_path / "x.png", b"whole")
