@@ -246,8 +246,8 @@ def loss_of(render, alphas):
 def test_absolute_gradients_are_sums_over_pixels_of_magnitudes(device, dtype, mode):
     *inputs, Ks = scene(dtype, device, n=12)
     inputs[0].requires_grad_()
-    size = 6
-    Ks = Ks * torch.tensor([[0.25], [0.25], [1.0]]).to(Ks)
+    size = 4
+    Ks = Ks * torch.tensor([[size / SIZE], [size / SIZE], [1.0]]).to(Ks)
     arguments = (*inputs, Ks, size, size)
     render, alphas, meta = rasterization(*arguments, render_mode=mode, absgrad=True)
     meta["means2d"].retain_grad()
