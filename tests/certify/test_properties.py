@@ -178,7 +178,7 @@ def test_skinning_by_one_transform_is_that_transform(seed):
     torch.testing.assert_close(moved.covars, linear @ scene["covars"] @ linear.T)
 
 
-@pytest.mark.parametrize("repeats", [5, pytest.param(60, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("repeats", [5, pytest.param(30, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", FAMILIES)
 def test_repeats_on_one_two_and_three_threads_give_the_same_bits(name, repeats, device):
     family = FAMILIES[name]
