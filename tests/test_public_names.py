@@ -131,7 +131,8 @@ def deny(event, arguments):
         raise SystemExit(f"network: {event} {arguments}")
 
 sys.addaudithook(deny)
-from oasis_warp.cli import main
+from oasis_warp.cli import main, reconstruct
+reconstruct.TURNTABLE_FRAMES = 2
 photo, out = sys.argv[1:]
 assert main(["reconstruct", photo, "-o", out, "--size", "64", "--steps", "2"]) == 0
 avatar = f"{out}/avatar.safetensors"
