@@ -5,7 +5,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.signal import butter, sosfiltfilt
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -73,6 +72,8 @@ def smooth(motion: Motion) -> Motion:
     """The motion through a Butterworth low pass at `CUTOFF`, forwards and backwards; short or slow ones stay."""
     if CUTOFF >= motion.fps / 2:
         return motion
+    from scipy.signal import butter, sosfiltfilt  # 1 s, which most commands that draw do without
+
     sections = butter(ORDER, CUTOFF, fs=motion.fps, output="sos")
     length = len(motion.angles)
     reach = min(round(motion.fps), length - 1)
