@@ -163,6 +163,14 @@ def even_cuts(n: int, least: int = MIN_TASKS) -> list[int]:
     return [n * k // parts for k in range(parts + 1)]
 
 
+def _launch_range(
+    kernel: Any, inputs: Sequence[Any], device: Any, stream: Any, lanes: int | None, bounds: tuple[int, int]
+) -> None:
+    first, end = bounds
+    dim = end - first if lanes is None else (end - first, lanes)
+    wp.launch(kernel, dim=dim, inputs=[first, *inputs], device=device, stream=stream, block_dim=256)
+
+
 def launch_ranges(
     kernel: Any, cuts: int | Sequence[int], inputs: Sequence[Any], like: Tensor, lanes: int | None = None
 ) -> None:
@@ -181,11 +189,7 @@ def launch_ranges(
 
     _load(kernel, device)
 
-    def run(bounds: tuple[int, int]) -> None:
-        first, end = bounds
-        dim = end - first if lanes is None else (end - first, lanes)
-        wp.launch(kernel, dim=dim, inputs=[first, *inputs], device=device, stream=stream, block_dim=256)
-
+    run = functools.partial(_launch_range, kernel, inputs, device, stream, lanes)
     n_threads = min(kernel_threads(), len(ranges))
     if device.is_cuda or n_threads < 2:
         for bounds in ranges:
