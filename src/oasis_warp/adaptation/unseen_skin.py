@@ -53,7 +53,7 @@ FINE_PASSES, SURELY_SEEN, FEWEST = 3, 0.97, 200
 """Smoothings over the mesh that leave a vertex's surroundings, 3 mm; confidence there from which it counts; fewest."""
 CLARITIES = 0.5, 1.2
 """Least and most gain of detail."""
-GRAIN = 0.025
+GRAIN = 0.04
 """Standard deviation of what each Gaussian on a face has of its own: pores and the mesh of fine wrinkles."""
 LUNULA, FREE_EDGE, NAIL_RIM = 0.07, 0.12, 0.16
 """How much paler a nail's lunula and its free edge are than its bed, and how much darker the fold around it."""
