@@ -14,6 +14,7 @@ from typing import Any
 
 from oasis_warp.data.photo import read_photo
 from oasis_warp.evaluation.methods import ONE_SHOT, Method, method_name
+from oasis_warp.evaluation.same_hand import gains
 from oasis_warp.evaluation.summary import (
     COLORS,
     GROUPS,
@@ -38,8 +39,8 @@ PICTURES = {"evaluation_sheet": "evaluation/sheet.png", "evaluation_attention": 
 """Pictures of docs/_static and where they come from."""
 ROWS_SHOWN = 1300
 """Rows of a picture that are shown [px]."""
-JUDGED = {"PSNR": ("psnr", 1), "SSIM": ("ssim_quarter", 1), "colours": ("error", -1)}
-"""Measures of a pair, and whether more or less is better."""
+JUDGED = {"PSNR": "psnr", "SSIM": "ssim_quarter", "colours": "error"}
+"""Measures by which priors are compared on a pair."""
 MOST = 0.25
 """Share of the pairs on which two priors differ most."""
 
@@ -128,17 +129,10 @@ def photos(found: dict[str, Any]) -> str:
 
 def where_priors_differ(pairs: list[Record]) -> str:
     """How often one-shot is better with the learned prior than without, where the two differ most by a measure."""
-    ours, plain = (
-        {(row["hand"], row["source"], row["target"]): row for row in pairs
-         if (row["prior"], row["stage"]) == (prior, ONE_SHOT)}
-        for prior in ("learned", "mean")
-    )  # fmt: skip
-    parts = []
-    for name, (measure, sign) in JUDGED.items():
-        gains = sorted(
-            (sign * (row[measure] - plain[pair][measure]) for pair, row in ours.items() if measure in row), key=abs
-        )
-        most = gains[-max(1, round(len(gains) * MOST)) :]
+    learned, plain, parts = Method("learned", ONE_SHOT), Method("mean", ONE_SHOT), []
+    for name, measure in JUDGED.items():
+        differences = sorted(gains(pairs, learned, plain, measure), key=abs)
+        most = differences[-max(1, round(len(differences) * MOST)) :]
         parts.append(f"{mean(gain > 0 for gain in most):.0%} by {name}")
     shares = ", ".join(parts)
     return f"Where learned and mean one-shot differ most (a quarter of the pairs), learned is better on {shares}."

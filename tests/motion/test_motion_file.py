@@ -385,7 +385,7 @@ def test_a_hand_that_moves_through_the_picture_is_followed(avatars, tmp_path):
     """The bundled photo, moved by 6 pixels a frame, and black once."""
     photo = np.asarray(cv2.imread(str(asset("photos", "palm_open_left_02.png"))))[..., ::-1]
     frames = [cv2.copyMakeBorder(photo, 0, 0, 6 * k, 60 - 6 * k, cv2.BORDER_REPLICATE) for k in range(7)]
-    frames[3] = np.zeros_like(frames[4])
+    frames[3] = np.zeros_like(frames[3])
     write_video(tmp_path / "film.mp4", [torch.from_numpy(np.ascontiguousarray(frame)) for frame in frames], 10.0)
     found = read_motion(tmp_path / "film.mp4", avatars["left"])
     assert len(found.angles) == 7

@@ -37,6 +37,8 @@ from oasis_warp.hand_avatar import Avatar, draw_as_photo, make_avatar
 from oasis_warp.losses import masked_psnr, ssim_map
 from oasis_warp.reconstruction import Reconstruction, reconstruct
 
+JUDGED = {"psnr": 1, "ssim_quarter": 1, "error": -1}
+"""Measures by which methods are compared on a pair, and whether more or less is better."""
 PHOTO_METHODS = (
     Method("mean", ONE_SHOT),
     Method("learned", RAW),
@@ -337,7 +339,6 @@ def _record(hand: str, pair: Pair, method: Method) -> Record:
 def summarise_pairs(pairs: Sequence[Record]) -> list[Record]:
     """A row for each method: medians over pairs, and the share of pairs on which the last method is better."""
     rows, best = [], PHOTO_METHODS[-1]
-    of_best = {_pair_key(pair): pair for pair in select(pairs, **best._asdict())}
     for method in PHOTO_METHODS:
         own = select(pairs, **method._asdict())
         if not own:
@@ -346,16 +347,21 @@ def summarise_pairs(pairs: Sequence[Record]) -> list[Record]:
         for name in MEASURES:
             values = [pair[name] for pair in own if name in pair]
             row[name] = statistics.median(values) if values else None
-        for name, sign in (("psnr", 1), ("ssim_quarter", 1), ("error", -1)):
-            changes = [
-                sign * (of_best[_pair_key(pair)][name] - pair[name])
-                for pair in own
-                if _pair_key(pair) in of_best and name in pair and name in of_best[_pair_key(pair)]
-            ]
-            compared = bool(changes) and method != best
-            row[f"beaten_{name}"] = sum(change > 0 for change in changes) / len(changes) if compared else None
+        for name in JUDGED:
+            changes = [] if method == best else gains(pairs, best, method, name)
+            row[f"beaten_{name}"] = sum(change > 0 for change in changes) / len(changes) if changes else None
         rows.append(row)
     return rows
+
+
+def gains(pairs: Sequence[Record], method: Method, other: Method, measure: str) -> list[float]:
+    """By how much `method` is better than `other`, by one of `JUDGED`, on each pair for which both have it."""
+    of_method = {_pair_key(pair): pair for pair in select(pairs, **method._asdict()) if measure in pair}
+    return [
+        JUDGED[measure] * (of_method[_pair_key(pair)][measure] - pair[measure])
+        for pair in select(pairs, **other._asdict())
+        if measure in pair and _pair_key(pair) in of_method
+    ]
 
 
 def _pair_key(pair: Record) -> tuple[str, str, str]:

@@ -115,7 +115,7 @@ def read_surface(
 
     The inside of the open wrist is no skin.
     """
-    small, faces = crop_camera(camera, 0.0, 0.0, float(camera.width), SIZE), hand.faces
+    small, faces = crop_camera(camera, 0.0, 0.0, float(camera.width), SIZE), hand.faces.to(vertices.device)
     seen = depth_map(vertices, faces, small.viewmat.to(vertices), small.K.to(vertices), SIZE, SIZE)
     silhouette, ids = seen.face_ids >= 0, seen.face_ids.clamp_min(0).long()
     values = torch.stack([visibility.to(vertices), palm.to(vertices)], -1)[faces[ids]]
@@ -127,7 +127,7 @@ def read_surface(
 
 def read_crop(crop: HandCrop) -> Surface:
     """What a photo's crop of `SIZE` shows, its interior that of mesh and mask together."""
-    hand = bundled_hand().to(crop.image.device)
+    hand = bundled_hand()
     seen = observe(hand, crop).confidence
     surface = read_surface(hand, crop.posed.vertices, crop.camera, seen, label_regions(hand).palm)
     mask = (inner_mask(crop.mask, RIM) > 0.5) & (crop.above_wrist > 0.5)
