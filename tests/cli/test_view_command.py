@@ -52,7 +52,7 @@ def test_the_page_is_served_at_its_address_only(server):
     assert (answer.status, body) == (200, b"<p>page</p>")
     assert answer.headers["Cache-Control"] == "no-store"
     assert ask(server, path, "HEAD")[1] == b""
-    for wrong in ("/", "/x/", path[:-1], path + "x", path + "../", f"/{server.token[:-1]}x/", f"{path}?q"):
+    for wrong in ("/", "/x/", path[:-1], path + "x", path + "../", f"/{server.token[:-1]}./", f"{path}?q"):
         answer, body = ask(server, wrong)
         assert answer.status == 404
         assert b"page" not in body
