@@ -10,7 +10,7 @@ from oasis_warp.adaptation.reliability import mask_unreliable
 from oasis_warp.adaptation.skin_detail import Places, flush_shade, relief, sample_detail
 from oasis_warp.adaptation.unseen_skin import MORE, SEEN, _clarities, _skin_detail, paint_unseen
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
-from oasis_warp.avatar.appearance import label_regions, region_colors
+from oasis_warp.avatar.appearance import label_regions, region_colors, skin_regions
 from oasis_warp.avatar.densify import coarsen
 from oasis_warp.avatar.observation import inner_mask, observe
 from oasis_warp.avatar.pose import with_shade_baked
@@ -151,7 +151,7 @@ def test_one_seed_gives_one_skin_and_another_seed_another(hand, palm_photo, pain
     assert float((one - two).square().mean().sqrt()) > 0.01
 
 
-def test_painting_adds_at_most_half_as_many_gaussians(palm_photo, painted):
+def test_painting_at_most_doubles_the_gaussians(palm_photo, painted):
     before, after = len(palm_photo[1].gaussians.colors), len(painted.gaussians.colors)
     assert 1.2 * before < after <= MORE * before
 
@@ -188,6 +188,18 @@ def test_nails_are_where_the_hand_model_has_them(hand):
     detail = sample_detail(hand, Places(index, index[:0], torch.zeros(0, 3)), 0)
     assert float(detail.plate[hand.nail > 0.95].mean()) > 0.8
     assert float(detail.plate[label_regions(hand).palm > 0.9].max()) < 0.1
+
+
+def test_palm_lines_are_one_persons_and_take_turns_with_the_seed(hand):
+    """Mixed place by place as the skin is, a line ended where another person's began."""
+    index = torch.arange(len(hand.template))
+    lines = [sample_detail(hand, Places(index, index[:0], torch.zeros(0, 3)), seed).fold for seed in range(4)]
+    torch.testing.assert_close(lines[0], lines[2])
+    torch.testing.assert_close(lines[1], lines[3])
+    palm = (hand.segment == 0) & (skin_regions(hand).palm > 0.95)
+    dark = [line[palm] > 0.5 for line in lines[:2]]
+    assert all(0.02 < float(where.float().mean()) < 0.3 for where in dark)
+    assert not torch.equal(*dark)
 
 
 def test_the_same_place_has_the_same_detail_as_a_vertex_and_on_a_face(hand):

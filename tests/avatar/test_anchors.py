@@ -5,9 +5,18 @@ import torch
 from synthetic import PALM_TO_CAMERA, posed_hand
 
 from oasis_warp.avatar.anchors import MIN_OPACITY, OPACITY, place_anchors, vertex_to_gaussians
-from oasis_warp.avatar.appearance import BLOOD, MELANIN, label_regions, region_colors, region_masks, skin_color
+from oasis_warp.avatar.appearance import (
+    BLOOD,
+    MELANIN,
+    label_regions,
+    region_colors,
+    region_masks,
+    skin_color,
+    skin_regions,
+)
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core import rotation, surface
+from oasis_warp.core.hand_model import TIP_JOINTS
 from oasis_warp.core.mirror import mirror_canonical, mirror_points
 from oasis_warp.hand.skinning import rest_hand
 from oasis_warp.ops import rest_mesh
@@ -93,6 +102,19 @@ def test_palm_and_back_lie_on_opposite_sides(hand, regions):
     palm = hand.template[regions.palm > 0.95, 1].mean()
     back = hand.template[regions.palm < 0.05, 1].mean()
     assert float(palm) < float(back)  # the palm faces -y
+
+
+def test_the_palms_skin_ends_in_one_soft_line_and_at_the_wrist(hand, regions):
+    """The labels jump by the whole beside the ball of the thumb: dark skin had a stain with an edge there."""
+    skin, edges = skin_regions(hand), surface.mesh_edges(hand.faces)
+    ball, wrist = ((hand.segment[edges] == bone).any(1) for bone in (TIP_JOINTS[0] - 2, 0))
+    labels, ours = (field[edges].diff(dim=1).abs()[ball & wrist].max() for field in (regions.palm, skin.palm))
+    assert float(labels) > 0.5
+    assert float(ours) < 0.25
+    assert float(skin.palm[hand.rim].max()) < 0.5
+    fingers = (hand.segment > 0) & (hand.segment != TIP_JOINTS[0] - 2)
+    assert float((skin.palm - regions.palm)[fingers].abs().mean()) < 0.01
+    assert torch.equal(skin.nail, regions.nail)
 
 
 def test_five_nails_lie_on_the_back_near_the_tips(hand, regions):

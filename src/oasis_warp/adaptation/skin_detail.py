@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from oasis_warp.assets import asset
-from oasis_warp.avatar.appearance import label_regions
+from oasis_warp.avatar.appearance import skin_regions
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians
@@ -65,7 +65,10 @@ class Places(NamedTuple):
 
 
 def sample_detail(hand: HandModel, gaussians: CanonicalGaussians | Places, seed: int) -> SkinDetail:
-    """Read the maps of three hands, mixed place by place and a little warped as `seed` says, at every Gaussian."""
+    """Read the maps at every Gaussian: skin of three hands, mixed place by place and a little warped as `seed` says.
+
+    The lines are one person's: where those of two were mixed, they ended abruptly. Persons take turns with the seed.
+    """
     device = gaussians.barycentrics.device
     faces = hand.faces.cpu().contiguous()
     noise = _smooth_noise(faces.numpy().tobytes(), faces.dtype, len(hand.template), seed)
@@ -84,9 +87,8 @@ def sample_detail(hand: HandModel, gaussians: CanonicalGaussians | Places, seed:
     maps, lines = (part.to(device) for part in _maps())
     moved = _sample(maps[: 3 * HANDS], place + shift).unflatten(1, (HANDS, 3))
     plate, pale, rim = _sample(maps[3 * HANDS :], place).unbind(1)  # not moved: nails and lines belong to their joints
-    one, other, vein = _sample(lines, FINER * place).unbind(1)
-    bare = 1 - plate
-    fold = torch.lerp(one, other, share[:, 0])
+    *folds, vein = _sample(lines, FINER * place).unbind(1)
+    bare, fold = 1 - plate, folds[(seed + 1) % len(folds)]
     skin = (moved * share[..., None]).sum(1)
     return SkinDetail(skin * bare[:, None], fold * bare, vein, plate, pale, rim)
 
@@ -176,7 +178,7 @@ def relief(hand: HandModel, seed: int) -> Float[Tensor, "V"]:
 
 def relief_shade(hand: HandModel, seed: int) -> Float[Tensor, "V 3"]:
     """What that adds to the logarithms of colours."""
-    heights, palm = relief(hand, seed)[:, None], label_regions(hand).palm.cpu()[:, None]
+    heights, palm = relief(hand, seed)[:, None], skin_regions(hand).palm.cpu()[:, None]
     wide = surface.smooth_over_mesh(heights, surface.mesh_edges(hand.faces.cpu()), WIDE_PASSES)
     heights = heights + WIDE * (1 - palm) * wide
     return heights * torch.lerp(heights.new_tensor(PER_MM), heights.new_tensor(PALM_PER_MM), palm)
@@ -196,7 +198,7 @@ FLUSH_PASSES = 6, 25
 @torch.no_grad()
 def flush_shade(hand: HandModel, seed: int) -> Float[Tensor, "V 3"]:
     """What blotches of blood add to the logarithms of colours. On the CPU, for equal bits; not to be written to."""
-    palm, edges = label_regions(hand).palm.cpu()[:, None], surface.mesh_edges(hand.faces.cpu())
+    palm, edges = skin_regions(hand).palm.cpu()[:, None], surface.mesh_edges(hand.faces.cpu())
     noise = torch.randn(len(palm), 2, generator=torch.Generator().manual_seed(seed + 3))
     layers = [surface.smooth_over_mesh(noise[:, k : k + 1], edges, n) for k, n in enumerate(FLUSH_PASSES)]
     blood = sum((layer - layer.mean()) / layer.std() for layer in layers) / len(layers) ** 0.5

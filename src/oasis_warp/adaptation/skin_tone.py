@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from oasis_warp.avatar.appearance import Regions, label_regions, skin_color
+from oasis_warp.avatar.appearance import Regions, skin_color, skin_regions
 from oasis_warp.avatar.prior import DARKEST, LIGHTEST, SIGMA_CAST, SIGMA_EXPOSURE, TONES
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.hand.template import bundled_hand
@@ -69,7 +69,7 @@ def infer_tone(
         reading: `HandCrop.reading`; without it the guess alone tells the tone.
     """
     table, nails = (part.to(seen) for part in _tone_table())
-    bare = 1 - label_regions(hand).nail.to(seen)
+    bare = 1 - skin_regions(hand).nail.to(seen)
     tones = torch.linspace(math.log(LIGHTEST), math.log(DARKEST), TONES).to(seen)
     log_melanin = _log_melanin(table, tones, guess.clamp_min(MIN_COLOR).log(), bare / bare.sum())
     read = None if reading is None else _melanin_read(table, tones, reading, bare)
@@ -120,7 +120,7 @@ def _log_melanin(
 @functools.cache
 def _tone_table() -> tuple[Float[Tensor, "T V 3"], Float[Tensor, "T 3"]]:
     """Logarithms of skin colours at the vertices and of a nail, for every tone."""
-    regions = label_regions(bundled_hand())
+    regions = skin_regions(bundled_hand())
     tones = torch.linspace(math.log(LIGHTEST), math.log(DARKEST), TONES).exp().tolist()
     pairs = [tone_colors(regions, tone) for tone in tones]
     return torch.stack([skin for skin, _ in pairs]).log(), torch.stack([nail for _, nail in pairs]).log()

@@ -13,7 +13,7 @@ from oasis_warp.adaptation.sharpen import FADE_REACH
 from oasis_warp.adaptation.skin_detail import Places, SkinDetail, flush_shade, relief_shade, sample_detail
 from oasis_warp.adaptation.skin_tone import MIN_COLOR, SkinTone, infer_tone
 from oasis_warp.avatar.anchors import RIM_FADE, vertex_colors, vertex_to_gaussians
-from oasis_warp.avatar.appearance import label_regions
+from oasis_warp.avatar.appearance import skin_regions
 from oasis_warp.avatar.densify import densify, part_centers
 from oasis_warp.avatar.observation import observe
 from oasis_warp.core import surface
@@ -29,13 +29,13 @@ JOIN_DETAIL, JOIN_REACH = 0.004, 0.04
 the person's mean colours [m]."""
 MAX_DIFFERENT = 0.3
 """Difference of the logarithms from the person's mean colours that is carried on: more is dirt, a ring or a shadow."""
-MORE = 1.5
+MORE = 2.0
 """Gaussians after painting over those before, at most."""
-PARTS = 2
+PARTS = 3
 """An edge, of faces that are cut for the painting."""
 SHOWS_FORM = 0.3
 """Cosine between normal and view from which a photo shows the forms of skin that it shows on a slant."""
-ON_PALM, ON_BACK = 2.0, 1.25
+ON_PALM, ON_BACK = 1.6, 1.25
 """Gain of the maps' detail on palms and on backs."""
 LOUDEST_ON_PALM, LOUDEST_ON_BACK = 0.2, 0.12
 """Logarithms of sRGB that this detail tends to. The maps have the same contrast all over palms, not over backs."""
@@ -108,7 +108,7 @@ def paint_unseen(
     seen = vertex_colors(gaussians, len(rest))
     tone = infer_tone(hand, vertex_colors(guess, len(rest)), seen, confidence, crop.reading)
     difference = seen.clamp_min(MIN_COLOR).log() - tone.log_skin
-    regions = label_regions(hand)
+    regions = skin_regions(hand)
     nail, palm = regions.nail.to(rest), regions.palm.to(rest)
     sure = ((confidence - SEEN) / (1 - SEEN)).clamp(0, 1) * (1 - nail)
     difference = difference.clamp(-MAX_DIFFERENT, MAX_DIFFERENT)
@@ -165,7 +165,7 @@ def _unseen_share(hand: HandModel, confidence: Float[Tensor, "V"]) -> Float[Tens
 def _nail_gloss(hand: HandModel, rest: Float[Tensor, "V 3"]) -> Float[Tensor, "V"]:
     """A stripe along each nail, where it reflects the sky: paint, which goes with the nail and not with the view."""
     normals = surface.vertex_normals(rest, hand.faces.to(rest.device))
-    on_nail, gloss = label_regions(hand).nail.to(normals), torch.zeros_like(normals[:, 0])
+    on_nail, gloss = skin_regions(hand).nail.to(normals), torch.zeros_like(normals[:, 0])
     for joint in TIP_JOINTS:
         on_bone = hand.segment.to(rest.device) == joint
         own, place = on_bone & (on_nail > 0), hand.bone_t.to(rest)[on_bone, None]
@@ -233,7 +233,7 @@ def _clarities(hand: HandModel, observations: VertexObservations) -> tuple[float
     logs = observations.colors[best].clamp_min(MIN_COLOR).log().mean(1, keepdim=True)
     fine = (logs - surface.smooth_over_mesh(logs, edges, FINE_PASSES))[:, 0].abs()
     inner = surface.smooth_over_mesh(observations.confidence[best][:, None], edges, FINE_PASSES)[:, 0] > SURELY_SEEN
-    palm = label_regions(hand).palm.to(fine) > 0.5
+    palm = skin_regions(hand).palm.to(fine) > 0.5
     sides = [fine[inner & side] for side in (palm, ~palm)]
     palm, back = (
         float(own.median()) / usual if len(own) >= FEWEST else None

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.core import surface
-from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.hand_model import TIP_JOINTS, HandModel
 
 MELANIN = (0.005, 0.01, 0.02, 0.04, 0.08, 0.15, 0.25, 0.35)
 """Volume share of melanosomes in the epidermis: light to dark."""
@@ -54,6 +54,10 @@ BLOOD_MEAN = 0.0125
 """Blood share of the back of the hand; one value serves the whole range of tones."""
 PALM_SMOOTHING = 5
 """Passes over the mesh that soften the border between palm and back."""
+BALL_PASSES, AT_BALL = 120, 1.5
+"""Passes that smooth this border beside the ball of the thumb, 20 mm, and the factor of where that is."""
+WRIST_END = (-0.009, 0.009)
+"""Range of the rest pose's x axis, which points up the arm, over which the palm's kind of skin ends [m]."""
 NAIL_WHITE = 0.14
 """Share of white that the nail plate adds."""
 NAIL_RIM_SHADE = 0.25
@@ -117,6 +121,25 @@ def label_regions(hand: HandModel) -> Regions:
     return Regions(
         palm, *soften.unbind(-1), _smoothstep(hand.nail, 0.3, 0.7), _mottle(len(hand.template), edges)
     )
+
+
+@functools.lru_cache(4)
+@torch.inference_mode(False)
+def skin_regions(hand: HandModel) -> Regions:
+    """`label_regions` with the palm's skin as it lies on real hands; kept, so not to be written to.
+
+    The angles about the bones jump between the ball of the thumb and the wrist, and so does the palm of those labels:
+    painted, it was a stain. This border crosses the ball in one line, and the wrist's skin is that of a back.
+    """
+    edges = surface.mesh_edges(hand.faces)
+    toward_palm = 0.5 - 0.5 * torch.cos(hand.bone_theta)
+    ball = (hand.segment == TIP_JOINTS[0] - 2).to(toward_palm)
+    wide, share = surface.smooth_over_mesh(torch.stack([toward_palm, ball], 1), edges, BALL_PASSES).unbind(1)
+    own = surface.smooth_over_mesh(toward_palm[:, None], edges, PALM_SMOOTHING)[:, 0]
+    beside = (AT_BALL * 4 * share * (1 - share)).clamp(max=1)
+    palm = _smoothstep(torch.lerp(own, wide, beside), 0.36, 0.74)
+    palm = palm * (1 - _smoothstep(hand.template[:, 0], *WRIST_END))
+    return label_regions(hand)._replace(palm=palm)
 
 
 def region_colors(regions: Regions, melanin: float) -> Float[Tensor, "V 3"]:
