@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from torch.nn.functional import normalize
 
 from oasis_warp.avatar.anchors import RIM_FADE, place_anchors, vertex_to_gaussians
 from oasis_warp.avatar.densify import densify
@@ -91,6 +92,24 @@ def test_the_detail_of_the_end_is_no_louder_than_skin(hand, hands):
     before_end = ((far > RIM_FADE) & (far < RIM_FADE + 0.2 * SHADE_FADE)).nonzero()[:, 0]
     logs = after.colors[before_end].log()
     assert (logs - logs.mean(0)).std() < 0.12  # it was .3, and ended at the rim in specks
+
+
+def test_the_arms_detail_varies_along_it(hand, hands):
+    """Past the 5 cm of skin that it repeats, one row of skin went on to the end: streaks along the arm."""
+    rest, before, _ = hands
+    noise = 0.1 * torch.randn(len(before.colors), 1, generator=torch.Generator().manual_seed(0))
+    after = close_wrist(hand, before._replace(colors=(before.colors * noise.exp()).clamp(max=1)), rest)
+    axis, arm = rim_axis(rest, hand.rim), arm_of(hand, rest, after)
+    at = centers(hand, rest, after)[arm] - rest[hand.rim].mean(0)
+    height, logs = at @ axis, after.colors[arm].log().mean(1)
+    out = at - height[:, None] * axis
+    chosen = (height > 0.055) & (out.norm(dim=1) > 0.02)
+    across = normalize(rest[hand.rim[0]] - rest[hand.rim].mean(0), dim=0)
+    angle = torch.atan2(out @ torch.linalg.cross(axis, across), out @ across)[chosen]
+    sector, logs = ((angle / math.pi + 1) * 32).long().clamp(0, 63), logs[chosen]
+    count = torch.bincount(sector, minlength=64).clamp_min(1)
+    means = torch.bincount(sector, logs, minlength=64) / count
+    assert float((logs - means[sector]).var() / logs.var()) > 0.6
 
 
 def test_the_hand_beyond_the_fade_keeps_its_bits_and_the_cap_goes_with_the_wrist(hand, hands):

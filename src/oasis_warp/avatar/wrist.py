@@ -37,6 +37,8 @@ FIRST_RING = 4
 """The first of these rings, 1.5 mm inside the rim: those before it stood out beside the arm."""
 MIRRORED = 0.05
 """The stretch of skin before the rim whose detail the end of the wrist repeats in the mirror [m]."""
+REPEATED = MIRRORED - RIM_FADE
+"""The stretch after which the mirror turns again [m]: past it the skin's last row would go on as streaks."""
 AVERAGED = 100
 """Number of nearest Gaussians of that skin, 6 mm around; detail is the difference of one from their mean. With 32 the
 blotches of a back ended at the rim."""
@@ -55,9 +57,9 @@ BEFORE_RIM, ASIDE = 0.008, 0.004
 STRAIGHT = 0.008
 """Length over which the arm turns from the direction of the skin before the rim into its own [m]: with a sudden turn
 outlines had a step. It and `FIRST_RING` were set by eye on two hands."""
-ARM_STEP, COARSER = 0.001, 3.0
+ARM_STEP, COARSER = 0.001, 1.6
 """Distance of the arm's Gaussians at the rim [m], half of that of the skin's vertices, and how much larger it is at the
-end: with 2 mm the skin's detail ended at the rim."""
+end: with 2 mm the skin's detail ended at the rim, with 3 times as much at the end the arm was blurred."""
 FILL_STEP = 0.004
 """Distance of the balls that fill the arm [m]."""
 ARM_LAYERS, FILL_LAYERS = 2.5, 12.0
@@ -186,6 +188,7 @@ def _continued(
 
     (aside, out, past), (skin_aside, _, before) = unrolled(points), unrolled(centers[skin])
     past = (radius - out).clamp_min(0) - past
+    past = REPEATED - ((past.clamp_min(0) % (2 * REPEATED)) - REPEATED).abs()
     keys = torch.cat([aside, past[:, None]], 1), torch.cat([skin_aside, before[:, None]], 1)
     source = _nearest(*keys, 1)[:, 0]
     logs, places = gaussians.colors[skin].clamp_min(DARKEST).log(), centers[skin]
