@@ -73,9 +73,9 @@ RIM = 3.0
 """Width of the islands' rims over which detail fades in: what lies beside them bled into them [texels]."""
 GREY, STEPS = 128, 400
 """Value of the maps that stands for none, and steps to one of the natural logarithm."""
-PEOPLE, LOUDEST_LINE = (44, 29), 2.0
+PEOPLE, LOUDEST_LINE = (19, 43), 2.0
 """People of the synthetic world whose palm's lines are taken, and the first one's veins; the strength of a line that is
-stored as 255. The photos' own lines are blurred. Of 46 people, these have clear lines that do not cross."""
+stored as 255. The photos' own lines are blurred. Of 46 people, these have long and soft lines that do not cross."""
 FOLDS, FOLDS_OF_THUMB = {1: (6, 6.5, 1.6), 2: (3, 2.2, 1.3)}, {2: (5, 4.5, 0.9)}
 """Number of folds over a finger's middle and end joint, how far from it they lie [mm], and their greatest strength. The
 thumb's middle joint has none: they looked like a scab there."""
