@@ -75,7 +75,7 @@ GREY, STEPS = 128, 400
 """Value of the maps that stands for none, and steps to one of the natural logarithm."""
 PEOPLE, LOUDEST_LINE = (19, 43), 2.0
 """People of the synthetic world whose palm's lines are taken, and the first one's veins; the strength of a line that is
-stored as 255. The photos' own lines are blurred. Of 46 people, these have long and soft lines that do not cross."""
+stored as 255. The photos' own lines are blurred. Chosen by eye among 46 people, for long and soft lines."""
 FOLDS, FOLDS_OF_THUMB = {1: (6, 6.5, 1.6), 2: (3, 2.2, 1.3)}, {2: (5, 4.5, 0.9)}
 """Number of folds over a finger's middle and end joint, how far from it they lie [mm], and their greatest strength. The
 thumb's middle joint has none: they looked like a scab there."""
@@ -88,8 +88,8 @@ darker fine lines looked like a hairy rash to strangers."""
 PAD_RIM = 3.0
 """Blur of the border between fingers and palm [texels]."""
 LINES_ON_PADS = 0.9
-"""How much of them stays on the palm's side of fingers. Gaussians of 1 mm drew lines as bars, with .45 of them as faint
-as stains; those of .7 mm draw creases."""
+"""How much of them stays on the palm's side of fingers. With .45, which suited Gaussians of 1 mm, creases
+looked like stains; Gaussians of .7 mm draw them sharply."""
 AROUND_PASSES = 20
 """Smoothings over the mesh that leave the skin around, some 10 mm: half of what a knuckle of 17 mm stands out stays."""
 NAIL_REACH = 1.0
