@@ -3,6 +3,7 @@ import torch
 from synthetic import avatar_of, crop_of
 
 from oasis_warp.avatar import folds as found
+from oasis_warp.avatar.anchors import vertex_colors
 from oasis_warp.avatar.appearance import label_regions
 from oasis_warp.avatar.pose import in_even_light, posed_lighting
 from oasis_warp.core.types import HandLight, HandPose
@@ -29,7 +30,7 @@ def wrinkled(hand):
 def colors_of_joint(avatar, angles, name):
     """Mean colour of the darkest folds of a joint in a pose."""
     folds = found.find_folds(avatar.hand, avatar.gaussians, avatar.invented, avatar.source_pose.angles)
-    of_joint = (folds.joint == avatar.hand.joint_names.index(name) - 1) & (folds.darkness.amin(1) > 0.15)
+    of_joint = (folds.joints == avatar.hand.joint_names.index(name) - 1).all(1) & (folds.change.amin(1) > 0.15)
     assert int(of_joint.sum()) > 20
     posed = avatar.pose(avatar.source_pose._replace(angles=angles))
     return float(posed.colors[..., folds.index[of_joint], :].mean())
@@ -69,8 +70,9 @@ def test_what_the_photo_shows_of_bent_fingers_stays_and_painted_folds_are_those_
         source_camera=wrinkled.source_camera, light=wrinkled.light._replace(facing=None, shade=None),
     )  # fmt: skip
     folds = found.find_folds(of_fist.hand, of_fist.gaussians, None, curled)
-    assert float(found.open_folds(folds, curled).logs.abs().max()) == 0
-    opened = found.open_folds(folds._replace(painted=torch.ones_like(folds.painted)), curled).logs
+    kept = found.open_folds(folds, curled)
+    assert float(kept.logs.abs().max()) == float(kept.share.max()) == float(kept.painted.abs().max()) == 0
+    opened = found.open_folds(folds._replace(painted=torch.ones_like(folds.painted)), curled).painted
     assert float(opened.amax()) > 0.1
     assert colors_of_joint(painted(of_fist), curled, "index2") > 1.1 * colors_of_joint(of_fist, curled, "index2")
 
@@ -100,3 +102,59 @@ def test_even_light_leaves_them_as_they_are(wrinkled):
     assert even.parts.folds is None
     posed = even.pose(even.source_pose._replace(angles=bent(even, "index2", 1.6)))
     assert torch.equal(posed.colors, even.gaussians.colors)
+
+
+@pytest.fixture(scope="module")
+def backs(hand):
+    """Avatars of flat hands whose backs have a dark line along the middle finger's bone, as deep as it says."""
+
+    def of(logarithm):
+        middle = hand.joints[hand.joint_names.index("middle1")]
+        along = hand.template[:, 0] / middle[0]
+        line = (hand.template[:, 2] - along * middle[2]).abs() < 0.002
+        deep = line & (along > 0.45) & (along < 0.85) & (label_regions(hand).palm < 0.1)
+        colors = 0.5 * torch.where(deep, logarithm, 0.0).exp()[:, None].expand(-1, 3)
+        crop, truth, pose = crop_of(hand, colors, size=64, pose_name="open")
+        even = torch.eye(9, 3)[:, :1].expand(9, 3).clone()
+        light = HandLight(even, torch.tensor([[0.2] * 3, [1.6] * 3]), torch.ones(3))
+        return avatar_of(hand, truth, pose, crop.camera, light), deep
+
+    return of
+
+
+def fist(avatar):
+    angles = avatar.source_pose.angles.clone()
+    angles[[avatar.hand.joint_names.index(f"{name}1") - 1 for name in ("index", "middle", "ring", "little")], 0] += 1.5
+    return angles
+
+
+def opened_by(avatar, angles):
+    """What the pose adds to the logarithms of the colours of all Gaussians."""
+    folds = found.find_folds(avatar.hand, avatar.gaussians, avatar.invented, avatar.source_pose.angles)
+    opened = found.open_folds(folds, angles)
+    return torch.zeros_like(avatar.gaussians.colors).index_copy(0, opened.index, opened.logs + opened.painted)
+
+
+def on_vertices(values, avatar):
+    return vertex_colors(avatar.gaussians._replace(colors=values), len(avatar.hand.template)).mean(1)
+
+
+def test_the_hollow_beside_a_tendon_becomes_shallow_in_a_fist_and_ink_stays(backs):
+    """A photo's trench of .4 in a fist looked like a scar."""
+    hollow, deep = backs(-0.4)
+    inked, _ = backs(-1.5)
+    assert 0.1 < float(on_vertices(opened_by(hollow, fist(hollow)), hollow)[deep].mean()) < 0.35
+    assert float(opened_by(hollow, hollow.source_pose.angles).abs().max()) == 0
+    assert float(on_vertices(opened_by(inked, fist(inked)), inked)[deep].abs().max()) < 0.05
+
+
+def test_knuckles_of_a_fist_are_pale_and_a_finger_that_stays_straight_keeps_its_own(backs):
+    plain, _ = backs(0.0)
+    hand = plain.hand
+    angles = fist(plain)
+    angles[hand.joint_names.index("index1") - 1] = plain.source_pose.angles[hand.joint_names.index("index1") - 1]
+    added = on_vertices(opened_by(plain, angles), plain)
+    back = label_regions(hand).palm < 0.1
+    for name, low, high in (("ring1", 0.05, 0.12), ("middle1", 0.05, 0.12), ("index1", -0.02, 0.02)):
+        apart = (hand.template - hand.joints[hand.joint_names.index(name)])[:, [0, 2]].norm(dim=1)
+        assert low < float(added[back & (apart < 0.002)].mean()) < high, name

@@ -16,7 +16,7 @@ from oasis_kernels import constants
 from oasis_warp.avatar import pose
 from oasis_warp.avatar.sky import studio_light
 from oasis_warp.core.camera import ORBIT_FIELD_OF_VIEW, orbit_camera
-from oasis_warp.export.page_file import page_html, page_text, unpack_data
+from oasis_warp.export.page_file import NO_JOINT, page_html, page_text, unpack_data
 from oasis_warp.ops import contact, sky_exposure
 from oasis_warp.reference import posing
 
@@ -33,6 +33,7 @@ NODE = shutil.which("node")
         ("shading.js", "OTHER_SKY", pose.OTHER_SKY),
         ("shading.js", "SAME_BESIDE", pose.SAME_BESIDE),
         ("shading.js", "OTHER_BESIDE", pose.OTHER_BESIDE),
+        ("shading.js", "NO_JOINT", NO_JOINT),
         ("shading.js", "WEAK", pose.WEAK),
         ("shading.js", "DEEP", pose.DEEP),
         ("sky.js", "BUFFER", sky_exposure.SIZE),

@@ -185,8 +185,8 @@ def shading_factors(
 ) -> Float[Tensor, "*B N 3"]:
     """Factors by which `light`, and the `opening` of folds, multiply the colours of Gaussians.
 
-    Without `seen` those in the photo itself; `viewed` is the `view_share`, 1 if not given. Nothing opens as far as the
-    photo's weak shade stays.
+    Without `seen` those in the photo itself; `viewed` is the `view_share`, 1 if not given. Painted folds are as in
+    the photo as far as its weak shade stays.
     """
     of_vertices = shading(light, on)
     if light.facing is None:
@@ -199,12 +199,15 @@ def shading_factors(
     if canonical.shade is None and opening is None:
         return _at_gaussians(of_vertices, faces, canonical)
     read = _at_gaussians(torch.cat([of_vertices, stays], -1), faces, canonical)
-    factors = _opened(read[..., :3], opening, read[..., 4:])
+    of_deep, of_weak = read[..., 3:4], read[..., 4:]
+    factors = _opened(read[..., :3], opening, of_weak)
     if canonical.shade is None:
         return factors
+    if opening is not None:
+        of_weak = of_weak.index_copy(-2, opening.index, of_weak.index_select(-2, opening.index) * (1 - opening.share))
     beyond = canonical.shade - 1
     deep = ((beyond.abs().amax(-1, keepdim=True) - WEAK) / (DEEP - WEAK)).clamp(0, 1)
-    return factors * (1 + torch.lerp(read[..., 4:], read[..., 3:4], deep) * beyond)
+    return factors * (1 + torch.lerp(of_weak, of_deep, deep) * beyond)
 
 
 def _opened(
@@ -212,7 +215,8 @@ def _opened(
 ) -> Float[Tensor, "*B N 3"]:
     if opening is None:
         return factors
-    logs = opening.logs if stays is None else opening.logs * (1 - stays.index_select(-2, opening.index))
+    gone = 1 if stays is None else 1 - stays.index_select(-2, opening.index)
+    logs = opening.logs + opening.painted * gone
     return factors.index_copy(-2, opening.index, factors.index_select(-2, opening.index) * logs.exp())
 
 

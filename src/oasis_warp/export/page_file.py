@@ -50,6 +50,8 @@ WALK_FRAMES, WALK_SECONDS = 12, 7.5
 """Frames from one of them to the next, which the page blends, and length of the motion."""
 
 
+NO_JOINT = 255
+"""Number of the joint of Gaussians without folds."""
 MAX_SHORTS, FEW_STEPS = 45, 63
 """Correctives that have 16 bits: three for each joint. MANO's 135 have so many steps to either side, to within .1 mm in
 all: 16 bits would fill 13 MB of the page."""
@@ -244,9 +246,7 @@ def _arrays(avatar: Avatar, light: SurfaceLight, folds: Folds) -> dict[str, np.n
         "skyAxes": _numpy(sky.axes, "f4"),
         "skyWeights": _numpy(sky.weights, "f4"),
     }
-    dark = torch.zeros_like(gaussians.colors).index_copy(0, folds.index, folds.darkness)
-    joint = folds.joint.new_zeros(len(dark)).index_copy(0, folds.index, folds.joint)
-    arrays |= {"folds": _pack(dark, "u1", 1.0), "foldJoint": _numpy(joint, "u1")}
+    arrays |= _fold_arrays(folds, len(gaussians.colors))
     if light.light.facing is not None:
         arrays["facing"] = _pack(light.light.facing, "i2", 1.0)
     if light.light.shade is not None:
@@ -260,6 +260,16 @@ def _arrays(avatar: Avatar, light: SurfaceLight, folds: Folds) -> dict[str, np.n
     if avatar.invented is not None:
         arrays["invented"] = _pack(avatar.invented, "u1", 1.0)
     return arrays
+
+
+def _fold_arrays(folds: Folds, count: int) -> dict[str, np.ndarray | Packed]:
+    """Folds as values of all Gaussians; those without have `NO_JOINT`."""
+    change = folds.change.new_zeros(count, 3).index_copy(0, folds.index, folds.change)
+    between = folds.between.new_zeros(count, 1).index_copy(0, folds.index, folds.between)
+    joints = torch.full_like(folds.joints[:1], NO_JOINT).repeat(count, 1).index_copy(0, folds.index, folds.joints)
+    return {
+        "folds": _pack(change, "i1", 1.0), "foldJoints": _numpy(joints, "u1"), "foldBetween": _pack(between, "u1", 1.0)
+    }  # fmt: skip
 
 
 def _numpy(values: Tensor, kind: str) -> np.ndarray:

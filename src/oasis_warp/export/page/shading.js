@@ -10,6 +10,7 @@ const SAME_SKY = 0.08, OTHER_SKY = 0.25; // changes of the share of the sky that
 const SAME_BESIDE = 0.02, OTHER_BESIDE = 0.08; // the same where the photo is in doubt
 const IN_HOLLOWS = [1, 1.2, 1.35], LEAST_LIGHT = [0.05, 0.02, 0.01]; // of light in hollows, as in avatar/sky.py
 const CLOSED = (15 * Math.PI) / 180, OPENED = (75 * Math.PI) / 180; // flexions between which folds open, as in avatar/folds.py
+const NO_JOINT = 255; // of Gaussians that have no folds
 const WEAK = 0.3, DEEP = 0.6; // differences of shade from 1, up to which it is the skin's own, and from which it is not
 const MAP_SEEN = [0.36, 0.6, 0.57], MAP_INVENTED = [0.89, 0.55, 0.28], MAP_SKIN = 0.35; // colours of the map; share of skin in it
 
@@ -24,7 +25,7 @@ function makeShading(body, { count }) {
 
 const between = (x, low, high) => Math.min(Math.max((x - low) / (high - low), 0), 1);
 
-// How far the folds over each joint are open: beyond the flexion in the photo, and for painted ones beyond a straight finger.
+// How far each joint opens folds: beyond the flexion in the photo, and painted ones beyond a straight finger.
 function openFolds(body, { opened }, angles) {
   const { straight, photo } = body.data.folds;
   for (let j = 0; j < straight.length; j++) {
@@ -96,23 +97,25 @@ function lightVertex({ harmonics: h, limits }, bounce, x, y, z, exposure, factor
 
 // Colours and opacities of all Gaussians, a byte each, into shading.colors. `light` is null for even light.
 function colorGaussians(body, gaussians, shading, light) {
-  const { colors: own, fineShade, even, folds, foldJoint, invented } = body.data.arrays, { count, corners, shares, heaviest, shown, opacities } = gaussians;
+  const { colors: own, fineShade, even, folds, foldJoints, foldBetween, invented } = body.data.arrays;
+  const { count, corners, shares, heaviest, shown, opacities } = gaussians;
   const { factors, colors, deep, opened } = shading;
   for (let i = 0; i < count; i++) {
     if (!shown[heaviest[i]]) continue;
     const a = 3 * i, p = shares[a], q = shares[a + 1], r = shares[a + 2];
     const u = 4 * corners[a], v = 4 * corners[a + 1], w = 4 * corners[a + 2];
     const weak = light ? p * factors[u + 3] + q * factors[v + 3] + r * factors[w + 3] : 1;
-    let stays = 0, open = 0;
-    if (light && folds[a + 1]) {
+    let stays = 0, open = 0, seenOpen = 0;
+    if (light && foldJoints[2 * i] < NO_JOINT) {
       const painted = invented ? p * invented[corners[a]] + q * invented[corners[a + 1]] + r * invented[corners[a + 2]] : 0;
-      const j = 2 * foldJoint[i];
-      open = (opened[j] + painted * (opened[j + 1] - opened[j])) * (1 - weak);
+      const j = 2 * foldJoints[2 * i], k = 2 * foldJoints[2 * i + 1], t = foldBetween[i];
+      seenOpen = (1 - painted) * (opened[j] + t * (opened[k] - opened[j]));
+      open = seenOpen + painted * (opened[j + 1] + t * (opened[k + 1] - opened[j + 1])) * (1 - weak);
     }
     if (light && fineShade) {
       const red = Math.abs(fineShade[a] - 1), green = Math.abs(fineShade[a + 1] - 1), blue = Math.abs(fineShade[a + 2] - 1);
       const share = between(Math.max(red, green, blue), WEAK, DEEP);
-      stays = (1 - share) * weak +
+      stays = (1 - share) * weak * (1 - seenOpen) +
         share * (p * deep[corners[a]] + q * deep[corners[a + 1]] + r * deep[corners[a + 2]]);
     }
     let packed = Math.round(255 * opacities[i]) << 24;
