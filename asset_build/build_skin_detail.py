@@ -92,6 +92,8 @@ LINES_ON_PADS = 0.9
 looked like stains; Gaussians of .7 mm draw them sharply."""
 AROUND_PASSES = 20
 """Smoothings over the mesh that leave the skin around, some 10 mm: half of what a knuckle of 17 mm stands out stays."""
+NAIL_LENGTH = 1.0
+"""Free edge of the nails [mm]: one Gaussian of painted skin."""
 NAIL_REACH = 1.0
 """Share of the nail's label from which on a texture's own nail is left out."""
 DARKEST = 0.02
@@ -116,23 +118,23 @@ def main(folder: Path) -> None:
     for k, detail in enumerate(details):
         stored = np.rint(GREY + STEPS * LOUDEST * np.tanh(detail / LOUDEST)).clip(0, 255).astype(np.uint8)
         write(target / f"detail_{k}.png", spread_out(stored, faces >= 0))
+    faces, places = rasterize(FINER * texel_corners(hand), FINER * BOX[3], FINER * BOX[2])
     write(target / "nails.png", spread_out(nails(hand, faces, places), faces >= 0))
-    write_lines(hand, target / "lines.png")
+    write(target / "lines.png", spread_out(lines(hand, faces, places), faces >= 0, fill=0))
     write_relief(hand, target / "relief.npz")
     maps = sorted([*target.glob("*.png"), *target.glob("*.npz")])
     sums = [f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.name}" for path in maps]
     (target / "SHA256").write_text("\n".join(sums) + "\n")
 
 
-def write_lines(hand: HandModel, path: Path) -> None:
-    """The drawn lines of two persons and one person's veins."""
-    faces, places = rasterize(FINER * texel_corners(hand), FINER * BOX[3], FINER * BOX[2])
+def lines(hand: HandModel, faces: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """The drawn lines of two persons and one person's veins, [H, W, 3]."""
     drawn = [knuckle_folds(number) + lines_on_palm(hand, number) for number in PEOPLE]
-    lines = 255 * resampled(torch.stack([*drawn, veins(hand)], 1) / LOUDEST_LINE, faces, places)
-    lines *= 1 - (1 - LINES_ON_PADS) * finger_pads(hand, faces, places, FINER)[..., None]
+    read = 255 * resampled(torch.stack([*drawn, veins(hand)], 1) / LOUDEST_LINE, faces, places)
+    read *= 1 - (1 - LINES_ON_PADS) * finger_pads(hand, faces, places, FINER)[..., None]
     before_wrist = shade_left(hand, hand.template)[:, 0]  # Gaussians stay coarse there, and thin lines would be dots
-    lines *= on_texels(before_wrist, hand, faces, places)[..., None]
-    write(path, spread_out(np.rint(np.clip(lines, 0, 255)).astype(np.uint8), faces >= 0, fill=0))
+    read *= on_texels(before_wrist, hand, faces, places)[..., None]
+    return np.rint(np.clip(read, 0, 255)).astype(np.uint8)
 
 
 def write_relief(hand: HandModel, path: Path) -> None:
@@ -309,7 +311,7 @@ def resampled(values: torch.Tensor, faces: np.ndarray, places: np.ndarray) -> np
 def nails(hand: HandModel, faces: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Plate, lunula and free edge, and fold around the plate, of a person with short round nails, [H, W, 3]."""
     texels = texels_on("cpu")
-    identity = sample_identity(hand, 0, 0, Population())._replace(nail_length=0.4, nail_shape=2.6, lunula=0.7)
+    identity = sample_identity(hand, 0, 0, Population())._replace(nail_length=NAIL_LENGTH, nail_shape=2.6, lunula=0.5)
     own = nail_maps(texels, identity, np.zeros(5))
     read = resampled(torch.stack([own.plate, own.plate * (own.lunula - own.free), own.rim], 1), faces, places)
     corners = hand.faces.numpy()[np.maximum(faces, 0)]

@@ -85,9 +85,9 @@ def sample_detail(hand: HandModel, gaussians: CanonicalGaussians | Places, seed:
     place, share, shift = read.split([2, HANDS, 2], 1)
     share = share.square() / share.square().sum(1, keepdim=True)
     maps, lines = (part.to(device) for part in _maps())
-    moved = _sample(maps[: 3 * HANDS], place + shift).unflatten(1, (HANDS, 3))
-    plate, pale, rim = _sample(maps[3 * HANDS :], place).unbind(1)  # not moved: nails and lines belong to their joints
-    *folds, vein = _sample(lines, FINER * place).unbind(1)
+    moved = _sample(maps, place + shift).unflatten(1, (HANDS, 3))
+    # not moved: lines and nails belong to their joints
+    *folds, vein, plate, pale, rim = _sample(lines, FINER * place).unbind(1)
     bare, fold = 1 - plate, folds[(seed + 1) % len(folds)]
     skin = (moved * share[..., None]).sum(1)
     return SkinDetail(skin * bare[:, None], fold * bare, vein, plate, pale, rim)
@@ -128,8 +128,8 @@ def _sample(maps: Float[Tensor, "C H W"], place: Float[Tensor, "N 2"]) -> Float[
 
 
 @functools.cache
-def _maps() -> tuple[Float[Tensor, "C H W"], Float[Tensor, "3 h w"]]:
-    """The detail of all hands with plate, paleness and rim of nails, and two persons' folds with one person's veins."""
+def _maps() -> tuple[Float[Tensor, "C H W"], Float[Tensor, "6 h w"]]:
+    """The detail of all hands; finer, two persons' folds, one person's veins, and plate, paleness and rim of nails."""
 
     def read(name: str) -> np.ndarray:
         stored = np.frombuffer(asset("skin", name).read_bytes(), np.uint8)
@@ -140,7 +140,7 @@ def _maps() -> tuple[Float[Tensor, "C H W"], Float[Tensor, "3 h w"]]:
     detail = [(read(f"detail_{k}.png") - GREY) / UNIT for k in range(HANDS)]
     lines = read("lines.png") * (LOUDEST_LINE / 255)
     nails = (read("nails.png") - np.float32([0, GREY, 0])) / np.float32([255, 127, 255])
-    channels = np.concatenate([*detail, nails], 2), lines
+    channels = np.concatenate(detail, 2), np.concatenate([lines, nails], 2)
     maps, fine = (torch.from_numpy(values).permute(2, 0, 1).contiguous() for values in channels)
     return maps, fine
 

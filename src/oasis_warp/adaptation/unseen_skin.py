@@ -55,8 +55,11 @@ CLARITIES = 0.5, 1.2
 """Least and most gain of detail."""
 GRAIN = 0.04
 """Standard deviation of what each Gaussian on a face has of its own: pores and the mesh of fine wrinkles."""
-LUNULA, FREE_EDGE, NAIL_RIM = 0.07, 0.12, 0.16
-"""How much paler a nail's lunula and its free edge are than its bed, and how much darker the fold around it."""
+LUNULA, FREE_EDGE, NAIL_RIM = (0.02, 0.08, 0.08), (0.06, 0.22, 0.22), (-0.12, -0.16, -0.16)
+"""What is added to the logarithms of the bed's colour on a nail's lunula and its free edge, and to skin in the fold
+around it."""
+BED = (0.0, -0.07, -0.05)
+"""The same on the outer half of the bed, which has more blood."""
 GLOSS, GLOSS_AT, GLOSS_WIDTH = 0.18, 0.15, 0.2
 """What a nail's gloss adds to the logarithms along a stripe, and takes beside it: where its normal leans to one side by
 this sine, and the stripe's width."""
@@ -122,7 +125,7 @@ def paint_unseen(
     form = (relief_shade(hand, seed) + flush_shade(hand, seed)).to(rest) * ((1 - nail) * unknown)[:, None]
     read = vertex_to_gaussians(
         torch.cat([
-            tone.log_skin + form + smooth, smooth + GLOSS * _nail_gloss(hand, rest)[:, None],
+            tone.log_skin + form + smooth, smooth + _nail_form(hand, rest),
             torch.stack([palm, invented, shown], 1),
         ], 1),
         faces,
@@ -162,18 +165,20 @@ def _unseen_share(hand: HandModel, confidence: Float[Tensor, "V"]) -> Float[Tens
     return torch.minimum(smooth, (hidden > 0).to(smooth))[:, 0]
 
 
-def _nail_gloss(hand: HandModel, rest: Float[Tensor, "V 3"]) -> Float[Tensor, "V"]:
-    """A stripe along each nail, where it reflects the sky: paint, which goes with the nail and not with the view."""
+def _nail_form(hand: HandModel, rest: Float[Tensor, "V 3"]) -> Float[Tensor, "V 3"]:
+    """Blood below each nail, and a stripe along it where it reflects the sky: paint, which goes with the nail."""
     normals = surface.vertex_normals(rest, hand.faces.to(rest.device))
-    on_nail, gloss = skin_regions(hand).nail.to(normals), torch.zeros_like(normals[:, 0])
+    on_nail, form = skin_regions(hand).nail.to(normals), torch.zeros_like(normals)
     for joint in TIP_JOINTS:
         on_bone = hand.segment.to(rest.device) == joint
         own, place = on_bone & (on_nail > 0), hand.bone_t.to(rest)[on_bone, None]
         along = ((place - place.mean()) * rest[on_bone]).sum(0)
         across = normalize(torch.linalg.cross(normals[own].mean(0), along), dim=0)
-        stripe = (-(((normals[own] @ across - GLOSS_AT) / GLOSS_WIDTH) ** 2)).exp()
-        gloss[own] = stripe - stripe.mean()
-    return gloss * on_nail
+        stripe = (-(((normals[own] @ across - GLOSS_AT) / GLOSS_WIDTH) ** 2)).exp()[:, None]
+        place = hand.bone_t.to(rest)[own, None]
+        outer = (2 * (place - place.amin()) / (place.amax() - place.amin()) - 0.5).clamp(0, 1)
+        form[own] = GLOSS * (stripe - stripe.mean()) + outer * form.new_tensor(BED)
+    return form * on_nail[:, None]
 
 
 def _nail_color(tone: SkinTone, seen: Tensor, weight: Float[Tensor, "V"], total: Tensor) -> Float[Tensor, "3"]:
@@ -199,7 +204,9 @@ def _parts(
     count = min(len(may), int((MORE - 1) * len(gaussians.opacities) / (PARTS**2 - 1)))
     centers = part_centers(PARTS).to(rest)
     places = Places(may[:0], may.repeat_interleave(len(centers)), centers.repeat(len(may), 1))
-    detail = _skin_detail(sample_detail(hand, places, seed), 0.0).mean(1).view(len(may), len(centers))
+    sample = sample_detail(hand, places, seed)
+    skin = _skin_detail(sample, 0.0)
+    detail = _paint(sample, skin, torch.zeros_like(skin)).mean(1).view(len(may), len(centers))
     _, areas = surface.face_normals(rest, faces)
     chosen = (detail.var(1) * areas[may]).argsort(descending=True, stable=True)[:count]
     return torch.ones_like(n_own).index_fill(0, may[chosen], PARTS)
@@ -251,5 +258,7 @@ def _gain_of(own: float | None, other: float | None) -> float:
 
 def _paint(detail: SkinDetail, skin: Float[Tensor, "N 3"], nail: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
     """Logarithms of the colours of skin, and of nails with their parts."""
-    pale = LUNULA * detail.pale.clamp_min(0) + FREE_EDGE * (-detail.pale).clamp_min(0)
-    return torch.lerp(skin, nail + pale[:, None], detail.plate[:, None]) - NAIL_RIM * detail.rim[:, None]
+    lunula, free, rim = (skin.new_tensor(part) for part in (LUNULA, FREE_EDGE, NAIL_RIM))
+    pale = detail.pale[:, None]
+    plate = nail + pale.clamp_min(0) * lunula + (-pale).clamp_min(0) * free
+    return torch.lerp(skin, plate, detail.plate[:, None]) + detail.rim[:, None] * rim
