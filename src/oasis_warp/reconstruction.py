@@ -18,7 +18,7 @@ from oasis_warp.adaptation.adapt import Adaptation, adapt, add_detail
 from oasis_warp.adaptation.photo_view import match_photo
 from oasis_warp.adaptation.rim_shade import limit_shade, match_rim
 from oasis_warp.adaptation.smooth_shade import spread_shade
-from oasis_warp.adaptation.unseen_skin import paint_unseen
+from oasis_warp.adaptation.unseen_skin import OwnSkin, PaintedSkin, paint_unseen
 from oasis_warp.avatar.densify import coarsen
 from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.avatar.prior import Prior
@@ -86,6 +86,8 @@ class Reconstruction(NamedTuple):
     """Warnings about the fit, the photo and what it shows; empty when nothing is doubtful."""
     quality: SurfaceQuality
     """How well each place of the surface is known."""
+    skin: OwnSkin | None = None
+    """Of what unseen skin was painted; None where none was."""
 
 
 class PhotoOfHand(NamedTuple):
@@ -118,6 +120,8 @@ class FusedReconstruction(NamedTuple):
     warnings: tuple[str, ...]
     quality: SurfaceQuality
     """How well each place of the surface is known."""
+    skin: OwnSkin | None = None
+    """Of what unseen skin was painted; None where none was."""
 
 
 Stage = Callable[[str], AbstractContextManager[None]]
@@ -164,7 +168,9 @@ def reconstruct(
     (own,) = fused.photos
     errors = {name: value for name, value in own.errors.items() if name != "best_percent"} | fused.errors
     warnings = (*own.fit.warnings, *of_coverage, *of_photo)
-    return Reconstruction(fused.avatar, own.fit, fused.prior, fused.stages, errors, warnings, fused.quality)
+    return Reconstruction(
+        fused.avatar, own.fit, fused.prior, fused.stages, errors, warnings, fused.quality, fused.skin
+    )  # fmt: skip
 
 
 def reconstruct_same_hand(
@@ -244,7 +250,8 @@ def _run(
         )  # fmt: skip
     with stage("detail"):
         adaptation = add_detail(hand, adaptation, close, close_scales, COARSE_SIZE, progress)
-    adaptation, invented = _finish(hand, adaptation, crops, close, config, stage)
+    adaptation, painted = _finish(hand, adaptation, crops, close, config, stage)
+    invented, skin = (None, None) if painted is None else (painted.invented, painted.skin)
     gaussians, light = adaptation.gaussians, adaptation.light
     avatar = make_avatar(fits[0], surfaces.shared, crops[0], gaussians, light, invented, hand=hand)
     with stage("quality"):
@@ -259,7 +266,7 @@ def _run(
     lights = adaptation.lights or [None] * len(photos)
     about = tuple(map(PhotoOfHand, [p.name for p in photos], fits, _tuples(adaptation.gains), measured, lights))
     coverage["n_gaussians"] = float(len(avatar.gaussians.opacities))
-    fused = FusedReconstruction(avatar, about, prior.about, stages, coverage, (), quality)
+    fused = FusedReconstruction(avatar, about, prior.about, stages, coverage, (), quality, skin)
     return _Outcome(fused, warnings, coverage_warnings(coverage))
 
 
@@ -288,16 +295,16 @@ def _fit(
 def _finish(
     hand: HandModel, adaptation: Adaptation, crops: Sequence[HandCrop], close: Sequence[HandCrop],
     config: ReconstructConfig, stage: Stage,
-) -> tuple[Adaptation, Float[Tensor, "V"] | None]:  # fmt: skip
-    """Paint what no photo shows and close the wrist: the adaptation, and where skin was painted.
+) -> tuple[Adaptation, PaintedSkin | None]:  # fmt: skip
+    """Paint what no photo shows and close the wrist: the adaptation, and what was painted.
 
     A single photo is also matched in its own view, at the size of its detail: several would undo each other's.
     """
-    gaussians, invented, first = adaptation.gaussians, None, crops[0]
+    gaussians, painted, first = adaptation.gaussians, None, crops[0]
     if config.unseen == "painted":
         with stage("painting"):
             painted = paint_unseen(hand, gaussians, adaptation.guess, first, adaptation.trusted, seed=config.seed)
-            gaussians, invented = painted.gaussians, painted.invented
+            gaussians = painted.gaussians
     rest, lights = first.rest.vertices, adaptation.lights
     if lights is not None:
         gaussians = limit_shade(hand, gaussians, crops, lights[0])
@@ -307,7 +314,7 @@ def _finish(
         if len(close) == 1:
             with stage("detail"):
                 gaussians = match_photo(hand, gaussians, close[0], lights[0])
-    return adaptation._replace(gaussians=close_wrist(hand, gaussians, rest), lights=lights), invented
+    return adaptation._replace(gaussians=close_wrist(hand, gaussians, rest), lights=lights), painted
 
 
 def _guess(

@@ -67,13 +67,23 @@ KNOWN_NAIL = 0.05
 """Share of all nails that must be seen to count as much as the mean person's."""
 
 
+class OwnSkin(NamedTuple):
+    """What the photos tell of skin that they do not show."""
+
+    tone: SkinTone
+    of_palm: float
+    """Gain of detail on the palm that suits the photo."""
+    of_back: float
+    """The same on the back."""
+
+
 class PaintedSkin(NamedTuple):
     """Gaussians with skin wherever no photo shows any."""
 
     gaussians: CanonicalGaussians
     invented: Float[Tensor, "V"]
     """1 where the skin is painted, 0 where it is as a photo shows it."""
-    tone: SkinTone
+    skin: OwnSkin
 
 
 @torch.no_grad()
@@ -111,8 +121,7 @@ def paint_unseen(
     seen = vertex_colors(gaussians, len(rest))
     tone = infer_tone(hand, vertex_colors(guess, len(rest)), seen, confidence, crop.reading)
     difference = seen.clamp_min(MIN_COLOR).log() - tone.log_skin
-    regions = skin_regions(hand)
-    nail, palm = regions.nail.to(rest), regions.palm.to(rest)
+    nail = skin_regions(hand).nail.to(rest)
     sure = ((confidence - SEEN) / (1 - SEEN)).clamp(0, 1) * (1 - nail)
     difference = difference.clamp(-MAX_DIFFERENT, MAX_DIFFERENT)
     smooth = inpaint(rest, faces, difference, sure, detail=JOIN_DETAIL, fade=JOIN_REACH)
@@ -122,21 +131,52 @@ def paint_unseen(
         gaussians, rest, faces, _parts(hand, gaussians, rest, torch.minimum(invented, 1 - shown), seed)
     ).gaussians
     unknown = (1 - first.visibility * first.facing / SHOWS_FORM).clamp(0, 1)
-    form = (relief_shade(hand, seed) + flush_shade(hand, seed)).to(rest) * ((1 - nail) * unknown)[:, None]
-    read = vertex_to_gaussians(
-        torch.cat([
-            tone.log_skin + form + smooth, smooth + _nail_form(hand, rest),
-            torch.stack([palm, invented, shown], 1),
-        ], 1),
-        faces,
-        fine,
-    )  # fmt: skip
-    detail = _skin_detail(sample := sample_detail(hand, fine, seed), read[:, 6:7]) + _grain(fine, seed)
-    of_palm, of_back = _clarities(hand, observations)
-    gain = of_back + (of_palm - of_back) * read[:, 6:7]
-    painted = _paint(sample, read[:, :3] + gain * detail, bed + read[:, 3:6])
-    looks = _mix(fine, painted, *read[:, 7:].clamp(0, 1).split(1, 1))
-    return PaintedSkin(looks, invented, tone)
+    skin = OwnSkin(tone, *_clarities(hand, observations))
+    form = _skin_form(hand, rest, seed) * unknown[:, None]
+    painted = _paint_on(
+        hand, fine, rest, tone.log_skin + form + smooth, bed + smooth + _nail_form(hand, rest), skin, seed
+    )
+    shares = vertex_to_gaussians(torch.stack([invented, shown], 1), faces, fine).clamp(0, 1)
+    return PaintedSkin(_mix(fine, painted, *shares.split(1, 1)), invented, skin)
+
+
+@torch.no_grad()
+def paint_hand(
+    hand: HandModel, guess: CanonicalGaussians, rest: Float[Tensor, "V 3"], skin: OwnSkin, *, seed: int
+) -> CanonicalGaussians:
+    """A hand that is painted all over: `paint_unseen` where nothing was seen.
+
+    Args:
+        hand: Model of the surface.
+        guess: Guess of the prior, whose places and shapes are taken.
+        rest: The surface at rest [m].
+        skin: Of its person.
+        seed: Seed of the detail.
+    """
+    faces, everywhere = hand.faces.to(rest.device), torch.ones_like(rest[:, 0])
+    fine = densify(guess, rest, faces, _parts(hand, guess, rest, everywhere, seed)).gaussians
+    nails = skin.tone.log_nail + _nail_form(hand, rest)
+    painted = _paint_on(hand, fine, rest, skin.tone.log_skin + _skin_form(hand, rest, seed), nails, skin, seed)
+    return fine._replace(colors=painted.exp().clamp(MIN_COLOR, 1), shade=None)
+
+
+def _skin_form(hand: HandModel, rest: Float[Tensor, "V 3"], seed: int) -> Float[Tensor, "V 3"]:
+    """What relief and blood add to the logarithms of bare skin."""
+    bare = 1 - skin_regions(hand).nail.to(rest)
+    return (relief_shade(hand, seed) + flush_shade(hand, seed)).to(rest) * bare[:, None]
+
+
+def _paint_on(
+    hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tensor, "V 3"], skin: Float[Tensor, "V 3"],
+    nails: Float[Tensor, "V 3"], own: OwnSkin, seed: int,
+) -> Float[Tensor, "N 3"]:  # fmt: skip
+    """Logarithms of the Gaussians' colours, from those of smooth skin and nails at the vertices."""
+    palm = skin_regions(hand).palm.to(rest)[:, None]
+    read = vertex_to_gaussians(torch.cat([skin, nails, palm], 1), hand.faces.to(rest.device), gaussians)
+    sample = sample_detail(hand, gaussians, seed)
+    detail = _skin_detail(sample, read[:, 6:]) + _grain(gaussians, seed)
+    gain = own.of_back + (own.of_palm - own.of_back) * read[:, 6:]
+    return _paint(sample, read[:, :3] + gain * detail, read[:, 3:6])
 
 
 def _mix(

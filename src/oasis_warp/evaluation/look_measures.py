@@ -7,8 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from oasis_warp.adaptation.unseen_skin import OwnSkin, paint_hand
 from oasis_warp.avatar.anchors import place_anchors
 from oasis_warp.avatar.appearance import label_regions
+from oasis_warp.avatar.prior import Prior
 from oasis_warp.avatar.quality import SEEN
 from oasis_warp.core.bands import split_bands
 from oasis_warp.core.config import ReconstructConfig
@@ -43,7 +45,7 @@ from oasis_warp.evaluation.views import (
     wrist_end,
 )
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.hand_avatar import Avatar
+from oasis_warp.hand_avatar import Avatar, make_avatar
 from oasis_warp.losses import Perceptual
 from oasis_warp.reconstruction import Reconstruction
 
@@ -66,14 +68,15 @@ class Looks(NamedTuple):
     record: Record
     """Measures; see `measure_looks`."""
     samples: dict[str, list[Sample]]
-    """Features of its pictures by kind of view: "input", "side" (but that of the photo) and "pose"."""
+    """Features of its pictures by kind: "input", "side" (but that of the photo), "pose", and "painted", the
+    photo's view of a hand that is painted all over."""
     cells: list[Cell]
     """Cells of the contact sheet."""
 
 
 @torch.no_grad()
 def measure_looks(
-    photo: Photo, made: Reconstruction, group: str, perceptual: Perceptual | None = None
+    photo: Photo, made: Reconstruction, group: str, prior: Prior, seed: int, perceptual: Perceptual | None = None
 ) -> Looks:
     """Draw the views of the avatar of `photo` and measure them.
 
@@ -84,6 +87,8 @@ def measure_looks(
         photo: What `made` was made of.
         made: By `reconstruct`.
         group: Group of the hand, for the kernel distance.
+        prior: That it was made with.
+        seed: Seed of its painting.
         perceptual: LPIPS.
     """
     avatar, left = made.avatar, made.avatar.side == "left"
@@ -94,20 +99,22 @@ def measure_looks(
     ]
     shown = crops[0].image.flip(1) if left else crops[0].image
     mask, first = crops[0].mask.flip(1) if left else crops[0].mask, pictures[0].image[None]
+    painted = None if made.skin is None else _draw_painted(made, made.skin, crops[0], prior, seed, pictures[0])
     record: Record = {
         "side": avatar.side,
         "input_psnr_db": made.errors["input_psnr_inner_db"],
         "seen_percent": made.errors["seen_percent"],
-        "contrast": contrast_measures(pictures, crops[0], left),
+        "contrast": contrast_measures(pictures, crops[0], left, painted),
         **blemish_measures(avatar, pictures),
         "lpips": None if perceptual is None else float(perceptual(first, shown[None], mask[None])[0]),
     }
-    samples: dict[str, list[Sample]] = {"input": [], "side": [], "pose": []}
-    for picture in pictures:
-        if picture.view.kind in samples and picture.view.name != "0":
+    samples: dict[str, list[Sample]] = {"input": [], "side": [], "pose": [], "painted": []}
+    kinds = [(picture.view.kind, picture) for picture in pictures if picture.view.name != "0"]
+    for kind, picture in kinds if painted is None else [*kinds, ("painted", painted)]:
+        if kind in samples:
             planes = (picture.image, picture.alpha)
             features = hand_features(*(plane.flip(1) for plane in planes) if left else planes)
-            samples[picture.view.kind].append(Sample(group, mostly_shows(picture.surface), features))
+            samples[kind].append(Sample(group, mostly_shows(picture.surface), features))
     large = crops[1].image.flip(1) if left else crops[1].image
     cells = [(large, photo.name)] + [(p.large.image, _view_label(p.view)) for p in pictures if p.view.kind != "back"]
     return Looks(record, samples, cells)
@@ -122,20 +129,37 @@ def draw_pictures(avatar: Avatar, visibility: Float[Tensor, "V"]) -> list[Pictur
     hand, pictures = bundled_hand(), []
     palm, left = label_regions(hand).palm, avatar.side == "left"
     for view in views_of(avatar):
-        drawn = draw(avatar, view)
         vertices = avatar.mesh(view.pose).vertices.cpu()
         surface = read_surface(hand, vertices, view.camera, visibility, palm, left=left)
-        surface = clear_of_arm(hand, surface, vertices, view.camera)
-        large = Render(drawn.image.cpu().clamp(0, 1), drawn.alpha.cpu())
-        bare = without_arm(hand, large, vertices, view.camera)
-        pictures.append(Picture(view, shrink(bare.image), shrink(bare.alpha), surface, large))
+        pictures.append(_draw_picture(avatar, view, clear_of_arm(hand, surface, vertices, view.camera)))
     return pictures
 
 
-def contrast_measures(pictures: Sequence[Picture], crop: HandCrop, left: bool) -> dict[str, Contrasts]:
+def _draw_picture(avatar: Avatar, view: View, surface: Surface) -> Picture:
+    drawn = draw(avatar, view)
+    large = Render(drawn.image.cpu().clamp(0, 1), drawn.alpha.cpu())
+    bare = without_arm(bundled_hand(), large, avatar.mesh(view.pose).vertices.cpu(), view.camera)
+    return Picture(view, shrink(bare.image), shrink(bare.alpha), surface, large)
+
+
+def _draw_painted(
+    made: Reconstruction, skin: OwnSkin, crop: HandCrop, prior: Prior, seed: int, first: Picture
+) -> Picture:
+    """The photo's view `first`, of the same hand in the same light, painted all over."""
+    avatar, rest = made.avatar, crop.rest.vertices
+    gaussians = paint_hand(bundled_hand(), prior(crop), rest, skin, seed=seed)
+    light = None if avatar.light is None else avatar.light._replace(shade=None, facing=None, doubt=None)
+    painted = make_avatar(made.fit, avatar.surface_offsets, crop, gaussians, light, torch.ones_like(rest[:, 0]))
+    return _draw_picture(painted, first.view, first.surface)
+
+
+def contrast_measures(
+    pictures: Sequence[Picture], crop: HandCrop, left: bool, painted: Picture | None = None
+) -> dict[str, Contrasts]:
     """Contrasts by band [%] of parts of the skin.
 
     - `photo`, `seen`: seen by the photo, in the photo and drawn in its view, on the same pixels;
+    - `photo_palm`, `painted_palm`, `photo_back`, `painted_back`: the same on either side, drawn as if it were unseen;
     - `turned`: seen by the photo, drawn in other poses;
     - `hidden_palm`, `hidden_back`: not seen at all, drawn from all sides in the photo's pose.
 
@@ -150,6 +174,10 @@ def contrast_measures(pictures: Sequence[Picture], crop: HandCrop, left: bool) -
         name: [(split_bands(log_brightness(shown), weight), where)]
         for name, shown in (("photo", image), ("seen", first.image))
     }
+    if painted is not None:
+        for side, part in side_masks(first.surface).items():
+            for name, shown in ((f"photo_{side}", image), (f"painted_{side}", painted.image)):
+                regions[name] = [(split_bands(log_brightness(shown), weight), where & part)]
     regions |= {"turned": [], "hidden_palm": [], "hidden_back": []}
     for picture in pictures:
         if picture.view.kind not in ("side", "pose"):

@@ -38,8 +38,10 @@ AVATARS, REAL, SHEETS = "avatars", "real", "sheets"
 """Files and folders that an evaluation writes; those of REAL are measures of the photos themselves."""
 IN_OVERVIEW = (0, 1, 4, 6, 8, 10, 12)
 """Cells of a sheet: photo, its view, 90, 180 and 270 degrees, open, fist."""
-REGIONS = ("seen", "turned", "hidden_palm", "hidden_back")
-KINDS = {"input": "the photo's view", "side": "novel sides", "pose": "novel poses"}
+REGIONS = ("seen", "turned", "hidden_palm", "hidden_back", "painted_palm", "painted_back")
+KINDS = {
+    "input": "the photo's view", "painted": "the photo's view, painted", "side": "novel sides", "pose": "novel poses"
+}  # fmt: skip
 SPLITS = 20
 """Random halves of the real hands whose distance is the floor."""
 WOUND = 0.4
@@ -153,7 +155,9 @@ def _measured(
         return record
     try:
         photo = read_photo(path)
-        looks = measure_looks(photo, reconstruct(photo, config, prior=prior), group, perceptual)
+        looks = measure_looks(
+            photo, reconstruct(photo, config, prior=prior), group, prior, config.seed, perceptual
+        )
     except InputError as error:
         record = {"left_out": str(error)}
     else:
@@ -165,10 +169,11 @@ def _measured(
 
 
 def relative_contrasts(record: Record, reference: Record) -> dict[str, list[float]]:
-    """Contrasts of each of `REGIONS` over those of the photo's own seen skin, or of real hands' for hidden skin."""
+    """Contrasts of each of `REGIONS` over the photo's own, or of hidden skin over those of real hands."""
     contrast = record["contrast"]
     yardsticks = {
         "seen": contrast.get("photo"), "turned": contrast.get("photo"),
+        **{f"painted_{side}": contrast.get(f"photo_{side}") for side in ("palm", "back")},
         **{f"hidden_{side}": reference.get(side, {}).get("median") for side in ("palm", "back")},
     }  # fmt: skip
     return {
@@ -227,7 +232,7 @@ def kernel_rows(samples: Mapping[str, Sequence[Sample]], real: Sequence[Record],
     rows = []
     drawn_backs = [sample for sample in samples["side"] if sample.mostly == "back"]
     pairs = {
-        **{name: (samples[kind], crowd) for kind, name in KINDS.items()},
+        **{KINDS[kind]: (own, crowd) for kind, own in samples.items()},
         "novel sides that show the back, to real backs": (drawn_backs, backs),
         "real palms to real backs": (palms, backs),
     }

@@ -176,7 +176,8 @@ LOOKS = {
 """Columns of the contrasts of `looks.summarise_looks`."""
 REGIONS = {
     "seen": "seen, in the photo's view", "turned": "seen, in other poses", "hidden_palm": "palm that the photo hides",
-    "hidden_back": "back that the photo hides",
+    "hidden_back": "back that the photo hides", "painted_palm": "palm, painted in the photo's view",
+    "painted_back": "back, painted in the photo's view",
 }  # fmt: skip
 BLEMISHES = {
     "input_psnr_db": Measure("PSNR of the photo's view, dB", ".1f"),
