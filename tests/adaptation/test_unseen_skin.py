@@ -8,7 +8,7 @@ from oasis_warp.adaptation import reliability, scraps
 from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.adaptation.reliability import mask_unreliable
 from oasis_warp.adaptation.skin_detail import Places, flush_shade, relief, sample_detail
-from oasis_warp.adaptation.unseen_skin import MORE, SEEN, _clarities, _skin_detail, paint_unseen
+from oasis_warp.adaptation.unseen_skin import MORE, SEEN, _clarities, _skin_detail, paint_hand, paint_unseen
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors, skin_regions
 from oasis_warp.avatar.densify import coarsen
@@ -188,6 +188,38 @@ def test_nails_are_where_the_hand_model_has_them(hand):
     detail = sample_detail(hand, Places(index, index[:0], torch.zeros(0, 3)), 0)
     assert float(detail.plate[hand.nail > 0.95].mean()) > 0.8
     assert float(detail.plate[label_regions(hand).palm > 0.9].max()) < 0.1
+
+
+def test_a_nail_ends_in_a_pale_free_edge_and_is_redder_than_its_lunula(hand, painted):
+    """One flat tone, a nail looked like plastic."""
+    nails = sample_detail(hand, painted.gaussians, 0)
+    bed, free, lunula = (where & (nails.plate > 0.9) for where in (
+        nails.pale.abs() < 0.05, nails.pale < -0.8, nails.pale > 0.8
+    ))  # fmt: skip
+    assert min(int(part.sum()) for part in (bed, free, lunula)) > 10
+    bed, free, lunula = (painted.gaussians.colors[part].log().mean(0) for part in (bed, free, lunula))
+    assert float((free - bed).mean()) > 0.1
+    assert float((bed - lunula)[0] - (bed - lunula)[1]) > 0.05
+
+
+def test_a_hand_that_is_painted_all_over_has_what_unseen_skin_is_given(hand, palm_photo, painted):
+    crop, adapted = palm_photo
+    whole = [
+        paint_hand(hand, adapted.guess, crop.rest.vertices, painted.skin, seed=seed) for seed in (0, 1)
+    ]  # fmt: skip
+    back = unseen_back(hand, painted)
+    colors = [
+        vertex_colors(each, len(back)).log().mean(1) for each in (painted.gaussians._replace(shade=None), *whole)
+    ]  # fmt: skip
+    inside = surface.mesh_edges(hand.faces)
+    fine = [(one - surface.smooth_over_mesh(one[:, None], inside, 8)[:, 0])[back] for one in colors]
+    same, other = (float(torch.corrcoef(torch.stack([fine[0], one]))[0, 1]) for one in fine[1:])
+    assert same > 0.8 and same > other + 0.1, (same, other)
+    assert float((colors[0] - colors[1])[back].mean().abs()) < 0.1
+    seen = (painted.invented == 0) & (label_regions(hand).palm > 0.9)
+    assert detail_of(hand, vertex_colors(whole[0], len(back)), seen) > 2 * detail_of(
+        hand, vertex_colors(painted.gaussians, len(back)), seen
+    )
 
 
 def test_palm_lines_are_one_persons_and_take_turns_with_the_seed(hand):

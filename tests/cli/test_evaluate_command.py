@@ -9,6 +9,8 @@ import pytest
 import torch
 
 from oasis_warp import reconstruction
+from oasis_warp.adaptation.skin_tone import SkinTone
+from oasis_warp.adaptation.unseen_skin import OwnSkin
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.avatar.quality import SurfaceQuality
 from oasis_warp.cli import evaluate as command
@@ -208,9 +210,12 @@ def test_looks_are_measured_and_drawn_and_the_run_is_not_done_twice(hands, scene
     monkeypatch.setattr(views, "POSES", ("open",))
     monkeypatch.setattr(looks, "IN_OVERVIEW", (0, 4))
     shown = torch.linspace(0, 1, len(avatar.rest.vertices))
+    even = torch.full_like(avatar.rest.vertices, 0.5).log()
+    skin = OwnSkin(SkinTone(even, even[0], 0.05), 1.0, 1.0)
     made = Reconstruction(
-        avatar, fit, {}, {}, {"input_psnr_inner_db": 30.0, "seen_percent": 40.0}, (), SurfaceQuality(shown, 1 - shown)
-    )
+        avatar, fit, {}, {}, {"input_psnr_inner_db": 30.0, "seen_percent": 40.0}, (), SurfaceQuality(shown, 1 - shown),
+        skin,
+    )  # fmt: skip
 
     def ship(photo, config, prior):
         assert config == ReconstructConfig(steps=1)  # all else as it ships
@@ -232,6 +237,7 @@ def test_looks_are_measured_and_drawn_and_the_run_is_not_done_twice(hands, scene
     found = json.loads((tmp_path / "found" / "metrics.json").read_text())
     record = found["photos"]["first.png"]
     assert record["contrast"]["seen"][0] > 0 and record["haze"] >= 0 and record["lpips"] is None
+    assert record["contrast"]["painted_back"][0] > record["contrast"]["photo_back"][0]  # the photo is of a smooth hand
     assert list(found["left_out"]) == ["no_hand.png"] and found["kernel_distance"] == []
     assert read_photo(tmp_path / "found" / "sheets" / "first.jpg").rgb.shape == (512, 6 * 512 + 10, 3)
     damaged = [tmp_path / "found" / name for name in ("real/mine_a.json", "sheets/first.jpg")]
