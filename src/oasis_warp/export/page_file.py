@@ -266,7 +266,7 @@ def _fold_arrays(folds: Folds, count: int) -> dict[str, np.ndarray | Packed]:
     """Folds as values of all Gaussians; those without have `NO_JOINT`."""
     change = folds.change.new_zeros(count, 3).index_copy(0, folds.index, folds.change)
     between = folds.between.new_zeros(count, 1).index_copy(0, folds.index, folds.between)
-    joints = torch.full_like(folds.joints[:1], NO_JOINT).repeat(count, 1).index_copy(0, folds.index, folds.joints)
+    joints = folds.joints.new_full((count, 2), NO_JOINT).index_copy(0, folds.index, folds.joints)
     return {
         "folds": _pack(change, "i1", 1.0), "foldJoints": _numpy(joints, "u1"), "foldBetween": _pack(between, "u1", 1.0)
     }  # fmt: skip
