@@ -45,7 +45,7 @@ from oasis_warp.core.types import (
 )
 from oasis_warp.data.avatar_file import DARK_HOLLOWS, load_avatar, save_avatar
 from oasis_warp.data.stored_avatar import StoredAvatar, from_file, to_header, to_tensors
-from oasis_warp.hand.contact import resolve_contact
+from oasis_warp.hand.contact import Touching, resolve_contact
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import rest_hand, skin, skin_surface
 from oasis_warp.hand.template import bundled_hand, chosen_hand
@@ -177,7 +177,7 @@ class Avatar:
             check_finite(angles=pose.angles, orientation=pose.orientation, translation=pose.translation)
         return HandPose(*(part.to(self.shape) for part in pose))
 
-    def _resolve_contact(self, vertices: Float[Tensor, "*B V 3"], pose: HandPose) -> Float[Tensor, "*B V 3"]:
+    def _resolve_contact(self, vertices: Float[Tensor, "*B V 3"], pose: HandPose) -> Touching:
         """Posed vertices after contact: nothing gives way in the photo's pose, whose colours were learned there."""
         changes = (pose.angles.detach() - self._source_angles).flatten(-2)
         return resolve_contact(self.hand, vertices, self.side, changes)
@@ -198,7 +198,7 @@ class Avatar:
         """
         pose = self._checked(pose, validate)
         posed = skin(self._model, self._rest, pose)
-        return posed._replace(vertices=self._resolve_contact(posed.vertices, pose))
+        return posed._replace(vertices=self._resolve_contact(posed.vertices, pose).vertices)
 
     def pose(self, pose: HandPose | str, *, camera: Camera | None = None, validate: bool = True) -> Gaussians:
         """The Gaussians in `pose`, in the world of its orientation and translation, where its light stays too.
@@ -223,7 +223,10 @@ class Avatar:
             center = camera_center(camera.viewmat.to(self.shape))
         posed = self._resolve_contact(skin_surface(self._model, self._rest, checked), checked)
         opening = None if self._folds is None else open_folds(self._folds, checked.angles)
-        return pose_gaussians(self._canonical, self.hand.faces, self._rest_mesh, posed, self._light, center, opening)
+        return pose_gaussians(
+            self._canonical, self.hand.faces, self._rest_mesh, posed.vertices, self._light, center, opening,
+            posed.closeness,
+        )  # fmt: skip
 
     def render(
         self, camera: Camera, pose: HandPose | str, background: Color = WHITE, *, validate: bool = True

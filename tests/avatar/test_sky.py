@@ -17,10 +17,12 @@ from oasis_warp.avatar.pose import (
     with_photo_colors,
 )
 from oasis_warp.avatar.sky import (
+    IN_CREVICES,
     arriving_before,
     bounced,
     environment_light,
     harmonic_basis,
+    in_crevices,
     radiance,
     sky_mesh,
     studio_light,
@@ -30,7 +32,9 @@ from oasis_warp.core.camera import camera_center
 from oasis_warp.core.mirror import mirror_light, mirror_points
 from oasis_warp.core.types import HandLight
 from oasis_warp.data import avatar_file
+from oasis_warp.hand.contact import resolve_contact
 from oasis_warp.hand.poses import named_pose
+from oasis_warp.hand.skinning import skin_surface
 from oasis_warp.hand_avatar import Avatar
 
 EVEN = HandLight(
@@ -321,3 +325,24 @@ def test_many_poses_have_each_their_share_of_the_shade_that_a_camera_sees(hand, 
     for own, each in zip(together, (pose, moved), strict=True):
         torch.testing.assert_close(own, avatar.pose(each, camera=crop.camera).colors)
     assert float((together[1] - together[0]).abs().mean()) > 0.05
+
+
+def test_skin_that_touches_is_dark_where_the_hand_hides_the_sky():
+    """Closed fingers were one lump of dough; flesh that came out on the other side was a black spot."""
+    closeness = torch.tensor([0.0, 0.5, 1.0, 1.0])
+    exposure = torch.tensor([0.2, 0.2, 0.2, 0.9])[:, None].expand(-1, 4)
+    left = in_crevices(closeness, exposure)
+    half = [(1 + least) / 2 for least in IN_CREVICES]
+    torch.testing.assert_close(left, torch.tensor([(1.0, 1, 1), half, IN_CREVICES, (1, 1, 1)]))
+
+
+def test_the_fist_of_an_avatar_is_darker_between_its_fingers(hand, monkeypatch):
+    crop, truth, source = crop_of(hand, 0.8 * region_colors(label_regions(hand), 0.03), pose_name="open", size=48)
+    avatar = avatar_of(hand, truth, source, crop.camera, None).in_light(studio_light())
+    dark = avatar.pose("fist").colors
+    monkeypatch.setattr(posing, "in_crevices", lambda closeness, exposure: torch.ones_like(exposure[..., 1:]))
+    change = (dark / avatar.pose("fist").colors)[: len(truth.vertex_index), 1]
+    pose = avatar.held("fist")
+    closeness = resolve_contact(hand, skin_surface(hand, avatar.rest, pose)).closeness[truth.vertex_index]
+    assert float(change[closeness > 0.5].median()) < 0.9
+    assert float(change[closeness == 0].quantile(0.1)) == 1

@@ -14,7 +14,7 @@ from oasis_warp.core import rotation, surface
 from oasis_warp.core.mirror import mirror_points
 from oasis_warp.core.processes import using_threads
 from oasis_warp.core.types import HandPose, PosedHand
-from oasis_warp.hand.contact import LIMIT, resolve_contact
+from oasis_warp.hand.contact import CREVICE, LIMIT, resolve_contact
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
 from oasis_warp.hand.skinning import rest_hand, skin, skin_surface
 
@@ -33,7 +33,7 @@ def fist(hand):
 
 @pytest.fixture(scope="module")
 def led_out(hand, fist):
-    return resolve_contact(hand, fist)
+    return resolve_contact(hand, fist).vertices
 
 
 def test_a_fist_of_another_shape_crosses_itself_ten_times_less(hand, fist, led_out):
@@ -60,38 +60,61 @@ def test_what_no_contact_reaches_stays_to_the_bit(hand, fist, led_out):
     assert still[hand.rim].all()
     assert 0.5 < float(still.float().mean()) < 0.95
     opened = posed(hand, "open", 103)
-    assert torch.equal(resolve_contact(hand, opened), opened)
+    assert torch.equal(resolve_contact(hand, opened).vertices, opened)
 
 
 def test_a_left_hand_gives_way_as_its_mirror_image(hand, fist, led_out):
-    mirrored = resolve_contact(hand, mirror_points(fist), "left")
+    mirrored = resolve_contact(hand, mirror_points(fist), "left").vertices
     torch.testing.assert_close(mirrored, mirror_points(led_out), rtol=0, atol=1e-6)
 
 
 def test_a_hand_that_moves_as_a_whole_gives_way_alike(hand, fist, led_out, device):
     turn = rotation.from_axis_angle(torch.tensor([0.6, 0.0, 0.8]), torch.tensor(1.9))
     shift = torch.tensor([0.1, -0.2, 0.4])
-    moved = resolve_contact(hand.to(device), (fist @ turn.T + shift).to(device)).cpu()
+    moved = resolve_contact(hand.to(device), (fist @ turn.T + shift).to(device)).vertices.cpu()
     off = (moved - (led_out @ turn.T + shift)).norm(dim=1)
     assert float((off > 1e-5).float().mean()) < 0.003  # of two vertices equally near it may take the other
 
 
 def test_near_the_photos_pose_skin_gives_way_in_part(hand, fist, led_out, device):
     changes = torch.tensor([0.01, math.radians(-5), 0.0], device=device)
-    made = resolve_contact(hand.to(device), fist.to(device), changes=changes).cpu()
+    made = resolve_contact(hand.to(device), fist.to(device), changes=changes).vertices.cpu()
     off = (made - torch.lerp(fist, led_out, 0.5)).norm(dim=1)
     assert float((off > 1e-5).float().mean()) < 0.003
+
+
+def test_closeness_is_that_to_skin_that_faces(hand, fist, led_out, device):
+    """Against every vertex of other bones."""
+    closeness = resolve_contact(hand.to(device), fist.to(device)).closeness.cpu()
+    near = closeness > 0
+    assert 0.1 < float(near.float().mean()) < 0.6
+    gaps = -CREVICE * closeness[near].log()
+    normals = surface.vertex_normals(led_out, hand.faces)
+    other = (normals[near] @ normals.T < 0) & (hand.segment[near, None] != hand.segment)
+    away = torch.cdist(led_out[near], led_out).where(other, math.inf).amin(1)
+    assert float((gaps - away).abs().quantile(0.9)) < 0.0025
+    touches, apart = (away > 0.001) & (away < 0.002), away > 0.004
+    assert float(gaps[touches].median()) < 0.0015 < 0.003 < float(gaps[apart].median())
+
+
+def test_closeness_begins_at_the_photos_pose(hand, fist, device):
+    """In the photo's pose skin shows its own dark lines; a step there would be seen in motion."""
+    model, surfaces = hand.to(device), torch.stack([fist] * 3).to(device)
+    changes = torch.tensor([[0.0], [math.radians(0.1)], [math.radians(10)]], device=device)
+    none, little, whole = resolve_contact(model, surfaces, changes=changes).closeness.cpu()
+    assert float(none.amax()) == 0 and 0 < float(little.amax()) <= 0.01001 and float(whole.amax()) > 0.6
+    assert resolve_contact(hand, fist, changes=torch.zeros(1)).closeness is None
 
 
 def test_many_poses_and_threads_give_the_same_bits(hand, fist, led_out):
     with using_threads(3):
         both = resolve_contact(hand, torch.stack([posed(hand, "open", 103), fist]))
-    assert torch.equal(both[1], led_out)
+    assert torch.equal(both.vertices[1], led_out)
 
 
 def test_the_shift_is_a_constant_to_derivatives(hand, fist):
     vertices = fist.double().requires_grad_()
-    (slope,) = torch.autograd.grad(resolve_contact(hand, vertices).sum(), vertices)
+    (slope,) = torch.autograd.grad(resolve_contact(hand, vertices).vertices.sum(), vertices)
     assert slope.eq(1).all()
 
 
@@ -110,10 +133,10 @@ def test_an_avatar_is_posed_out_of_its_own_flesh_but_in_the_photos_pose(hand):
     _, made, plain = surfaces(0)
     assert torch.equal(made, plain)
     means, made, plain = surfaces(11)
-    assert torch.equal(made, resolve_contact(hand, plain)) and not torch.equal(made, plain)
+    assert torch.equal(made, resolve_contact(hand, plain).vertices) and not torch.equal(made, plain)
     torch.testing.assert_close(means, made[truth.vertex_index])
     _, made, plain = surfaces(5)
-    torch.testing.assert_close(made - plain, (resolve_contact(hand, plain) - plain) / 2, rtol=1e-3, atol=1e-7)
+    torch.testing.assert_close(made - plain, (resolve_contact(hand, plain).vertices - plain) / 2, rtol=1e-3, atol=1e-7)
 
 
 @pytest.mark.gpu
@@ -124,7 +147,7 @@ def test_resolving_contact_is_recorded_in_a_graph(hand, fist):
     with torch.cuda.graph(graph):
         made = resolve_contact(hand, vertices)
     graph.replay()
-    assert torch.equal(made, expected)
+    assert torch.equal(made.vertices, expected.vertices) and torch.equal(made.closeness, expected.closeness)
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@
 //
 // `boxes` (parts, then a thread per vertex for normals) -> `meetings` (parts; a lane for each part of a group) ->
 // `find` (vertices; a lane for each part or vertex of a part) -> rounds of `contacts` and `spread` (vertices; `LANES`
-// lanes for the neighbours). Of two vertices equally near, the one that stands first is taken, as on the CPU.
+// lanes for the neighbours) -> `closeness`. Of two vertices equally near, the one that stands first is taken, as on the CPU.
 
 __global__ void boxes(
 #include "contact_parameters.inc"
@@ -166,34 +166,10 @@ __global__ void contacts(
     float margin
 ) {
 #include "../posing/vectors_cuda.h"
-#include "contact_keys.h"
-    const long long row = (long long)block_index * (BLOCK / LANES) + threadIdx.x / LANES;
-    const int lane = threadIdx.x % LANES;
-    if (row >= (long long)batch * n) return;
-    const long long b = row / n;
-    const int v = (int)(row - b * n), last = others[row];
+#include "contact_nearest.h"
     V4 wish = {0.f, 0.f, 0.f, 0.f};
     if (last >= 0) {
-        const unsigned together = ((1u << LANES) - 1) << (threadIdx.x & (32 - LANES));
-        const float *x = points + 3 * b * n, *facing = normals + 3 * b * n;
-        auto place = [&](int j) -> V3 {
-            const V3 y = get3(x, j);
-            return shifts ? plus(y, get3(shifts + 3 * b * n, j)) : y;
-        };
-        const V3 here = place(v), normal = get3(facing, v), first = minus(place(last), here);
-        Key best = key_of(dot3(first, first), 0);
-        const int start = offsets[last];
-        for (int e = start + lane; e < offsets[last + 1]; e += LANES) {
-            const int j = neighbours[e];
-            const V3 r = minus(place(j), here);
-            const float distance = dot3(r, r);
-            if (distance < squared_of(best) && dot3(normal, get3(facing, j)) < opposed)
-                best = key_of(distance, e - start + 1);
-        }
-        best = nearest_of(best, together, LANES);
-        const int at = (int)(unsigned)best, other = at ? neighbours[start + at - 1] : last;
-        const V3 m = get3(facing, other), r = minus(place(other), here);
-        const float depth = dot3(r, m), both = give[v] + give[other];
+        const float both = give[v] + give[other];
         if (depth > -margin && dot3(r, r) - depth * depth < aside * aside && both > 0.f) {
             const V3 s = scaled((depth + margin) * give[v] / both, m);
             wish = {s.x, s.y, s.z, 1.f};
@@ -240,4 +216,31 @@ __global__ void spread(
         if (changes) moved = scaled(fminf(most / whole, 1.f), moved);
     }
     if (lane == 0) put3(out, row, moved);
+}
+
+__global__ void closeness(
+#include "contact_parameters.inc"
+#include "contact_neighbours.inc"
+    const float* shifts,  // [B, V, 3]
+    float opposed,
+    float aside,           // half the distance between vertices, which is no gap
+    const float* changes,  // [B, K] or 0: see `contact_shifts`
+    int n_changes,
+    float whole,
+    float width,
+    float* close  // [B, V]: exp(-gap / width)
+) {
+#include "../posing/vectors_cuda.h"
+#include "contact_nearest.h"
+    float found = 0.f;
+    if (last >= 0) {
+        const float past = sqrtf(fmaxf(dot3(r, r) - depth * depth, 0.f)) - aside;
+        found = expf(-(fmaxf(-depth, 0.f) + fmaxf(past, 0.f)) / width);
+        if (changes) {
+            float most = 0.f;
+            for (int k = 0; k < n_changes; k++) most = fmaxf(most, fabsf(changes[b * n_changes + k]));
+            found *= fminf(most / whole, 1.f);
+        }
+    }
+    if (lane == 0) close[row] = found;
 }

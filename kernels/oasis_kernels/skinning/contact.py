@@ -5,7 +5,8 @@ thread per part and image: `boxes` of its skin, and of its skin with the flesh u
 next to it meets any. One thread per group: `group_boxes`. One per part and group: `meetings`, the parts of the group
 that have skin where it has flesh, or the other way round. One thread per vertex: `normals` of what is reached; `find`,
 the nearest skin that the vertex faces in those parts; `contacts`, the same again among neighbours of the last one, and
-the shift that leads out of it; `spread`, the mean of the shifts around. Normals are those before contact.
+the shift that leads out of it; `spread`, the mean of the shifts around; `closeness`, how near to that skin
+this leaves the vertex. Normals are those before contact.
 """
 
 import warp as wp
@@ -203,6 +204,33 @@ def find(
     out[b, v] = other
 
 
+@wp.func
+def nearest_now(
+    points: wp.array2d[wp.vec3f],
+    shifts: wp.array2d[wp.vec3f],
+    normals: wp.array2d[wp.vec3f],
+    offsets: wp.array[wp.int32],
+    neighbours: wp.array[wp.int32],
+    opposed: float,
+    b: int,
+    v: int,
+    last: int,
+):
+    """Of `last` and its neighbours the vertex nearest to v that v faces, after both have moved."""
+    x = points[b, v] + shifts[b, v]
+    n = normals[b, v]
+    other = last
+    r = points[b, last] + shifts[b, last] - x
+    for e in range(offsets[last], offsets[last + 1]):
+        j = neighbours[e]
+        s = points[b, j] + shifts[b, j] - x
+        if wp.dot(s, s) < wp.dot(r, r):
+            if wp.dot(n, normals[b, j]) < opposed:
+                other = j
+                r = s
+    return other
+
+
 @wp.kernel
 def contacts(
     first: int,
@@ -224,17 +252,8 @@ def contacts(
     found = wp.vec4f()
     last = others[b, v]
     if last >= 0:
-        x = points[b, v] + shifts[b, v]
-        n = normals[b, v]
-        other = last
-        r = points[b, last] + shifts[b, last] - x
-        for e in range(offsets[last], offsets[last + 1]):
-            j = neighbours[e]
-            s = points[b, j] + shifts[b, j] - x
-            if wp.dot(s, s) < wp.dot(r, r):
-                if wp.dot(n, normals[b, j]) < opposed:
-                    other = j
-                    r = s
+        other = nearest_now(points, shifts, normals, offsets, neighbours, opposed, b, v, last)
+        r = points[b, other] + shifts[b, other] - points[b, v] - shifts[b, v]
         m = normals[b, other]
         depth = wp.dot(r, m)
         both = give[v] + give[other]
@@ -274,3 +293,29 @@ def spread(
         if length > give[v]:
             moved = moved * (give[v] / length)
     out[b, v] = moved
+
+
+@wp.kernel
+def closeness(
+    first: int,
+    points: wp.array2d[wp.vec3f],
+    shifts: wp.array2d[wp.vec3f],
+    normals: wp.array2d[wp.vec3f],
+    others: wp.array2d[wp.int32],  # of `find`
+    offsets: wp.array[wp.int32],
+    neighbours: wp.array[wp.int32],
+    opposed: float,
+    aside: float,  # half the distance between vertices, which is no gap
+    width: float,
+    out: wp.array2d[wp.float32],  # exp(-gap / width); not changed where a vertex has no other
+):
+    i = first + wp.tid()
+    b = i // points.shape[1]
+    v = i - b * points.shape[1]
+    last = others[b, v]
+    if last >= 0:
+        other = nearest_now(points, shifts, normals, offsets, neighbours, opposed, b, v, last)
+        r = points[b, other] + shifts[b, other] - points[b, v] - shifts[b, v]
+        depth = wp.dot(r, normals[b, other])
+        past = wp.sqrt(wp.max(wp.dot(r, r) - depth * depth, 0.0)) - aside
+        out[b, v] = wp.exp(-(wp.max(-depth, 0.0) + wp.max(past, 0.0)) / width)

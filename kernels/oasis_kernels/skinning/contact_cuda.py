@@ -23,3 +23,5 @@ contacts = _build("contacts", "contacts")
 """Kernel: `LANES` threads for each vertex of each image."""
 spread = _build("spread", "contact_spread")
 """Kernel: `LANES` threads for each vertex of each image."""
+closeness = _build("closeness", "contact_closeness")
+"""Kernel: `LANES` threads for each vertex of each image."""

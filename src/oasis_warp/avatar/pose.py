@@ -9,7 +9,7 @@ from torch import Tensor
 
 from oasis_warp.avatar.anchors import vertex_to_gaussians
 from oasis_warp.avatar.folds import Opening
-from oasis_warp.avatar.sky import arriving, arriving_before, exposure, harmonic_basis, largest_nearby
+from oasis_warp.avatar.sky import arriving, arriving_before, exposure, harmonic_basis, in_crevices, largest_nearby
 from oasis_warp.core import rotation, surface
 from oasis_warp.core.mirror import mirror_light, mirror_points
 from oasis_warp.core.types import CanonicalGaussians, Gaussians, HandLight
@@ -70,6 +70,8 @@ class Lighting(NamedTuple):
     """Unit, in the world of the photo's camera."""
     exposure: Float[Tensor, "*B V 4"] | None
     """As `sky.exposure`; None where the hand hides nothing of the light."""
+    closeness: Float[Tensor, "*B V"] | None = None
+    """Of each vertex to other skin, 0 to 1; None where none is near."""
 
 
 def mirror_surface_light(light: SurfaceLight) -> SurfaceLight:
@@ -87,11 +89,15 @@ def posed_lighting(
 
 
 def lighting(
-    posed: Float[Tensor, "*B V 3"], quats: Float[Tensor, "*B V 4"], normals: Float[Tensor, "V 3"], light: HandLight
+    posed: Float[Tensor, "*B V 3"],
+    quats: Float[Tensor, "*B V 4"],
+    normals: Float[Tensor, "V 3"],
+    light: HandLight,
+    closeness: Float[Tensor, "*B V"] | None = None,
 ) -> Lighting:
     """The same for vertices rotated by `quats`; exposure is a constant to derivatives."""
     facing = rotation.rotate(quats, normals.expand_as(posed))
-    return Lighting(facing, None if light.albedo is None else exposure(posed, facing, quats, light))
+    return Lighting(facing, None if light.albedo is None else exposure(posed, facing, quats, light), closeness)
 
 
 def with_photo(
@@ -148,6 +154,8 @@ def shading(light: HandLight, on: Lighting) -> Float[Tensor, "*B V 3"]:
     received = torch.minimum(torch.maximum(received, least), most)
     if on.exposure is not None and light.albedo is not None:
         received = received * arriving(on.exposure[..., 1:], light.albedo)
+        if on.closeness is not None:
+            received = received * in_crevices(on.closeness, on.exposure)
     return received.pow(1 / GAMMA)
 
 
@@ -292,6 +300,7 @@ def pose_gaussians(
     light: SurfaceLight | None = None,
     center: Float[Tensor, "3"] | None = None,
     opening: Opening | None = None,
+    closeness: Float[Tensor, "*B V"] | None = None,
 ) -> Gaussians:
     """Gaussians that follow the surface from `rest_vertices` to `posed_vertices` (the paper's appendix B.1).
 
@@ -301,7 +310,8 @@ def pose_gaussians(
     `rest_mesh`. If `posed_vertices` have a leading axis of poses, so have means, quats and scales. With a `light`, so
     have the colours: they are drawn in it, without the part that the posed surface hides. With the `center` of a
     camera, shade fades as that camera leaves the side of the photo; without, it is as the photo's camera saw it. With
-    an `opening`, folds over bent joints are open in that light.
+    an `opening`, folds over bent joints are open in that light. With the `closeness` of the `posed_vertices` to other
+    skin, little light comes between fingers that touch.
     """
     means, quats, scales, vertex_quats = pose_mesh_gaussians(
         rest_vertices, posed_vertices, faces, canonical.face_index, canonical.barycentrics, canonical.vertex_index,
@@ -309,7 +319,7 @@ def pose_gaussians(
     )  # fmt: skip
     colors = canonical.colors
     if light is not None and vertex_quats is not None:
-        on = lighting(posed_vertices, vertex_quats, light.normals, light.light)
+        on = lighting(posed_vertices, vertex_quats, light.normals, light.light, closeness)
         viewed = None
         if center is not None and light.photo_view is not None:
             viewed = view_share(light.photo_view, view_direction(posed_vertices, center))

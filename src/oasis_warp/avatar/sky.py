@@ -26,6 +26,12 @@ there, and redder. Chosen on 41 photos of same_hand; `python -m studies hollows`
 LEAST_LIGHT = (0.05, 0.02, 0.01)
 """Share of red, green and blue light that reaches skin which sees no sky, where two fingers touch: black lines of the
 width of a coarse face looked like gaps. Set by eye on two photos of same_hand."""
+IN_CREVICES = (0.03, 0.012, 0.008)
+"""Shares of red, green and blue light that reach skin which touches other skin. Depth buffers of 3 mm and faces of 5 mm
+do not show the dark lines between closed fingers."""
+DEEP_INSIDE, OUTSIDE = 0.4, 0.6
+"""Shares of the sky that a vertex sees up to which skin close by hides the rest of the light, and from which it hides
+none: flesh that lies inside other flesh by more than both can yield may end on the other side."""
 THROUGH_SKIN = (0.15, 0.07, 0.04)
 """The same in files of version 7, which had no other powers."""
 NOTHING_HIDDEN, SCATTERED = 4, 7
@@ -137,8 +143,15 @@ def bounced(exposure: Float[Tensor, "*B 3"], albedo: Float[Tensor, "3"]) -> Floa
 
 def arriving(exposure: Float[Tensor, "*B 3"], albedo: Float[Tensor, "3"]) -> Float[Tensor, "*B 3"]:
     """The share of the light that arrives directly, after bounces, or through the skin beside it."""
-    least, powers = _constants(exposure.device).to(exposure)
+    least, powers, _ = _constants(exposure.device).to(exposure)
     return least + (1 - least) * bounced(exposure, albedo) ** powers
+
+
+def in_crevices(closeness: Float[Tensor, "*B V"], exposure: Float[Tensor, "*B V 4"]) -> Float[Tensor, "*B V 3"]:
+    """Share of the light that skin close by leaves, where vertices see little of the sky past the hand."""
+    inside = ((OUTSIDE - exposure[..., 0]) / (OUTSIDE - DEEP_INSIDE)).clamp(0, 1)
+    hidden = (inside * closeness)[..., None]
+    return 1 - hidden * (1 - _constants(closeness.device)[2]).to(closeness)
 
 
 def arriving_before(version: int, exposure: Float[Tensor, "*B 3"], albedo: Float[Tensor, "3"]) -> Float[Tensor, "*B 3"]:
@@ -150,10 +163,10 @@ def arriving_before(version: int, exposure: Float[Tensor, "*B 3"], albedo: Float
 
 
 @functools.cache
-def _constants(device: torch.device) -> Float[Tensor, "2 3"]:
-    """`LEAST_LIGHT` and `IN_HOLLOWS`; kept, because a graph must not copy them from the host."""
+def _constants(device: torch.device) -> Float[Tensor, "3 3"]:
+    """`LEAST_LIGHT`, `IN_HOLLOWS` and `IN_CREVICES`; kept, because a graph must not copy them from the host."""
     with torch.inference_mode(False):
-        return torch.tensor([LEAST_LIGHT, IN_HOLLOWS], device=device)
+        return torch.tensor([LEAST_LIGHT, IN_HOLLOWS, IN_CREVICES], device=device)
 
 
 DEGREES = (0, 1, 1, 1, 2, 2, 2, 2, 2)

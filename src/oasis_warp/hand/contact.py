@@ -2,6 +2,7 @@
 
 import functools
 import math
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -30,8 +31,19 @@ NAIL_EDGE = 2
 """Rings around a nail over which skin becomes free of it."""
 FREE = math.radians(10)
 """Change of a joint's angle up to which skin gives way only in part [rad]."""
+CREVICE = 0.0024
+"""Gap to other skin over which closeness falls to 1/e [m]."""
 SAMPLES = 8
 """Faces whose mean normal is that of a patch."""
+
+
+class Touching(NamedTuple):
+    """Posed vertices after contact."""
+
+    vertices: Float[Tensor, "*B V 3"]
+    """[m]."""
+    closeness: Float[Tensor, "*B V"] | None
+    """Of each vertex to other skin that it faces: exp(-gap / `CREVICE`); None where nothing is near."""
 
 
 def resolve_contact(
@@ -39,7 +51,7 @@ def resolve_contact(
     vertices: Float[Tensor, "*B V 3"],
     side: Side = "right",
     changes: Float[Tensor, "*B K"] | None = None,
-) -> Float[Tensor, "*B V 3"]:
+) -> Touching:
     """Move posed vertices of a hand out of each other: both sides of a contact yield, each by at most `LIMIT`.
 
     Fingers yield by up to `YIELD` of their thickness, nails not at all. Vertices that no contact reaches keep their
@@ -54,12 +66,15 @@ def resolve_contact(
     """
     if changes is not None:
         if changes.is_cpu and not changes.any():
-            return vertices
+            return Touching(vertices, None)
         changes = changes.detach().float().reshape(-1, changes.shape[-1])
     flat = vertices.detach().float().reshape(-1, *vertices.shape[-2:])
     tables = contact_tables(vertices.device)
-    shifts = contact_shifts(flat, hand.faces, tables, side == "left", changes, FREE)
-    return vertices if shifts is None else vertices + shifts.to(vertices).view_as(vertices)
+    found = contact_shifts(flat, hand.faces, tables, side == "left", changes, FREE, CREVICE)
+    if found is None:
+        return Touching(vertices, None)
+    moved = vertices + found.shifts.to(vertices).view_as(vertices)
+    return Touching(moved, found.closeness.to(vertices).view(vertices.shape[:-1]))
 
 
 @functools.cache

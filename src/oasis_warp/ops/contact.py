@@ -35,6 +35,8 @@ FADES = 0.5
 """Share of the skin around a vertex that touches, below which its shift fades: that at the edge of a contact."""
 ROUNDS = 6
 """Rounds of contact resolution; later ones make up for what the mean took from the first."""
+BETWEEN = 0.0015
+"""Distance along the skin to the nearest vertex that is no gap: that between vertices [m]."""
 PAD = 0.003
 """Margin around a part's box [m]: normals of the flesh below differ from the part's own and lead that far aside."""
 MIN_PARTS = 64
@@ -68,6 +70,16 @@ class ContactTables(NamedTuple):
     """Their weights; each row sums to 1."""
 
 
+class Contact(NamedTuple):
+    """What contact does to posed surfaces."""
+
+    shifts: Float[Tensor, "B V 3"]
+    """That lead the vertices out of other parts of the same surface [m]; 0 where no contact reaches."""
+    closeness: Float[Tensor, "B V"]
+    """exp(-gap / width) of what the shifts leave of the gap to the nearest skin that faces the vertex; 0 where there is
+    no such skin within `DEEPEST`."""
+
+
 _CONTACT = Declaration(
     "contact_shifts",
     inputs={"vertices": Array("B V 3"), "faces": Array("F 3", index="V"), "changes": Array("B K", optional=True)},
@@ -83,8 +95,9 @@ def contact_shifts(
     mirrored: bool,
     changes: Float[Tensor, "B K"] | None = None,
     whole: float = 1.0,
-) -> Float[Tensor, "B V 3"] | None:
-    """Shifts that lead the vertices of posed surfaces out of other parts of the same surface; None if nothing touches.
+    width: float = 0.001,
+) -> Contact | None:
+    """Lead the vertices of posed surfaces out of other parts of the same surface; None if nothing touches.
 
     A vertex in other flesh, at most `DEEPEST` from the nearest skin that it faces, moves along the normal of that skin,
     which comes towards it by its own share. A mean over the vertices around makes a dent of it. Vertices that no
@@ -96,8 +109,10 @@ def contact_shifts(
         faces: Corners.
         tables: Tables of that surface.
         mirrored: Whether faces wind the other way.
-        changes: Changes from a pose in which nothing gives way: shifts are those times the largest one over `whole`.
+        changes: Changes from a pose in which nothing gives way: shifts and closeness are those times the largest one
+            over `whole`.
         whole: Largest change from which on everything gives way.
+        width: Gap over which closeness falls to 1/e [m].
 
     Raises:
         ValueError: a wrong shape or index.
@@ -108,12 +123,11 @@ def contact_shifts(
         parts = []
         for k in range(0, len(vertices), MAX_SURFACES):
             some, by = aligned(*(None if t is None else t[k : k + MAX_SURFACES] for t in (vertices, changes)))
-            parts.append(_shifts_on_cuda(some, index, tables, outward, by, whole))
-        return parts[0] if len(parts) == 1 else torch.cat([vertices[:0], *parts])  # there may be none
-    shifts = _shifts_on_cpu(vertices.contiguous(), index, tables, outward)
-    if shifts is None or changes is None:
-        return shifts
-    return (changes.abs().amax(1) / whole).clamp(max=1)[:, None, None] * shifts
+            parts.append(_contact_on_cuda(some, index, tables, outward, by, whole, width))
+        none = Contact(vertices[:0], vertices[:0, :, 0])
+        return parts[0] if len(parts) == 1 else Contact(*map(torch.cat, zip(none, *parts, strict=True)))
+    share = None if changes is None else (changes.abs().amax(1, keepdim=True) / whole).clamp(max=1)
+    return _contact_on_cpu(vertices.contiguous(), index, tables, outward, share, width)
 
 
 def _empty(vertices: Float[Tensor, "B V 3"], *shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -121,9 +135,10 @@ def _empty(vertices: Float[Tensor, "B V 3"], *shape: int, dtype: torch.dtype = t
     return vertices.new_empty((len(vertices), *shape), dtype=dtype)
 
 
-def _shifts_on_cpu(
-    vertices: Float[Tensor, "B V 3"], index: Incidence, t: ContactTables, outward: float
-) -> Float[Tensor, "B V 3"] | None:
+def _contact_on_cpu(
+    vertices: Float[Tensor, "B V 3"], index: Incidence, t: ContactTables, outward: float,
+    share: Float[Tensor, "B 1"] | None, width: float,
+) -> Contact | None:  # fmt: skip
     batch, n, n_parts, n_groups = *vertices.shape[:2], *t.allowed.shape
 
     empty = functools.partial(_empty, vertices)
@@ -154,13 +169,18 @@ def _shifts_on_cpu(
         given = [leads, before, t.part, state, *around, t.weights, t.give, FADES, vectors(after, 2)]
         launch_ranges(kernels.spread, batch * n, given, vertices)
         shifts = after
-    return shifts
+    if share is not None:
+        shifts = share[..., None] * shifts
+    close = torch.zeros_like(vertices[..., 0])
+    given = [points, vectors(shifts, 2), normals, others, *around, OPPOSED, BETWEEN, width, close]
+    launch_ranges(kernels.closeness, batch * n, given, vertices)
+    return Contact(shifts, close if share is None else share * close)
 
 
-def _shifts_on_cuda(
+def _contact_on_cuda(
     vertices: Float[Tensor, "B V 3"], index: Incidence, t: ContactTables, outward: float,
-    changes: Float[Tensor, "B K"] | None, whole: float,
-) -> Float[Tensor, "B V 3"]:  # fmt: skip
+    changes: Float[Tensor, "B K"] | None, whole: float, width: float,
+) -> Contact:  # fmt: skip
     batch, n, n_parts, n_groups = *vertices.shape[:2], *t.allowed.shape
 
     empty = functools.partial(_empty, vertices)
@@ -191,4 +211,6 @@ def _shifts_on_cuda(
         params["out"] = empty(n, 3)
         run_cuda(contact_cuda.spread, params, rows, stream)
         params["shifts"] = params["out"]
-    return params["shifts"]
+    params["close"] = empty(n)
+    run_cuda(contact_cuda.closeness, params | {"aside": BETWEEN, "width": width}, rows, stream)
+    return Contact(params["shifts"], params["close"])

@@ -5,6 +5,7 @@ const DEEPEST = 0.005, ASIDE = 0.003, PUSH = 0.00075, PAD = 0.003; // metres
 const OPPOSED = -0.3, PARTS_OPPOSED = 0.3; // cosines of normals
 const FADES = 0.5; // share of the skin around a vertex that touches, below which its shift fades
 const ROUNDS = 6;
+const BETWEEN = 0.0015, CREVICE = 0.0024; // metres: no gap along the skin, gap over which closeness falls to 1/e
 const FREE = Math.PI / 18; // change of an angle from the photo's pose
 const BOX = 15; // numbers a part: corners of its skin, corners of its skin with the flesh under it, normal
 
@@ -22,6 +23,7 @@ function makeContact({ data, faces, nVertices: n }) {
     outward: data.side === "left" ? -1 : 1, boxes: new Float64Array(BOX * nParts), met: Array(nParts),
     reached: new Uint8Array(nParts), normals: new Float32Array(3 * n), others: new Int32Array(n),
     shifts: new Float32Array(3 * n), wanted: new Float32Array(4 * n), mean: new Float32Array(4 * n),
+    closeness: new Float32Array(n), // of each vertex to other skin that it faces
   };
 }
 
@@ -46,8 +48,10 @@ function eachNear({ start, index }, v, use) {
 }
 
 // Move the vertices of body.posed out of each other; not at all in the photo's pose, and wholly from FREE away from it.
+// How close to other skin that leaves them goes into contact.closeness.
 function giveWay({ data, posed, faces, around, start, contact }, angles) {
   const bent = Math.max(...angles.map((angle, k) => Math.abs(angle - data.poses[0].angles[k])));
+  contact.closeness.fill(0);
   if (bent === 0) return;
   boxParts(contact, posed, faces);
   if (!meetParts(contact)) return;
@@ -66,7 +70,9 @@ function giveWay({ data, posed, faces, around, start, contact }, angles) {
     spreadShifts(contact);
   }
   const share = Math.min(bent / FREE, 1);
-  for (let i = 0; i < posed.length; i++) posed[i] += share * shifts[i];
+  for (let i = 0; i < posed.length; i++) shifts[i] *= share;
+  findCloseness(contact, posed, share);
+  for (let i = 0; i < posed.length; i++) posed[i] += shifts[i];
 }
 
 function addArea(points, faces, f, sum) {
@@ -150,25 +156,42 @@ function findOthers({ n, part, met, boxes, members, starts, normals, others }, p
 const facing = (normals, i, j) =>
   normals[3 * i] * normals[3 * j] + normals[3 * i + 1] * normals[3 * j + 1] + normals[3 * i + 2] * normals[3 * j + 2];
 
+// Of the last nearest vertex and those around it the one that is nearest to v now, and how deep v lies under it.
+function nearestNow({ rings: { start, index }, normals, others, shifts }, points, v) {
+  const last = others[v];
+  const x = points[3 * v] + shifts[3 * v], y = points[3 * v + 1] + shifts[3 * v + 1], z = points[3 * v + 2] + shifts[3 * v + 2];
+  let other = last, squared = Infinity;
+  for (let e = start[last]; e < start[last + 1]; e++) {
+    for (let k = start[index[e]]; k < start[index[e] + 1]; k++) {
+      const j = index[k], rx = points[3 * j] + shifts[3 * j] - x, ry = points[3 * j + 1] + shifts[3 * j + 1] - y;
+      const rz = points[3 * j + 2] + shifts[3 * j + 2] - z, distance = rx * rx + ry * ry + rz * rz;
+      if (distance < squared && (j === last || facing(normals, v, j) < OPPOSED)) (squared = distance), (other = j);
+    }
+  }
+  const o = 3 * other, rx = points[o] + shifts[o] - x, ry = points[o + 1] + shifts[o + 1] - y;
+  const depth = rx * normals[o] + ry * normals[o + 1] + (points[o + 2] + shifts[o + 2] - z) * normals[o + 2];
+  return { other, squared, depth };
+}
+
+function findCloseness(contact, points, share) {
+  const { n, others, closeness } = contact;
+  for (let v = 0; v < n; v++) {
+    if (others[v] < 0) continue;
+    const { squared, depth } = nearestNow(contact, points, v);
+    const past = Math.sqrt(Math.max(squared - depth * depth, 0)) - BETWEEN;
+    closeness[v] = share * Math.exp(-(Math.max(-depth, 0) + Math.max(past, 0)) / CREVICE);
+  }
+}
+
 // The shift that leads each vertex out of the skin nearest to it now, and 1 where there is one.
-function leadOut({ n, rings: { start, index }, give, normals, others, shifts, wanted }, points) {
+function leadOut(contact, points) {
+  const { n, give, normals, others, wanted } = contact;
   wanted.fill(0);
   for (let v = 0; v < n; v++) {
-    const last = others[v];
-    if (last < 0) continue;
-    const x = points[3 * v] + shifts[3 * v], y = points[3 * v + 1] + shifts[3 * v + 1], z = points[3 * v + 2] + shifts[3 * v + 2];
-    let other = last, nearest = Infinity;
-    for (let e = start[last]; e < start[last + 1]; e++) {
-      for (let k = start[index[e]]; k < start[index[e] + 1]; k++) {
-        const j = index[k], rx = points[3 * j] + shifts[3 * j] - x, ry = points[3 * j + 1] + shifts[3 * j + 1] - y;
-        const rz = points[3 * j + 2] + shifts[3 * j + 2] - z, distance = rx * rx + ry * ry + rz * rz;
-        if (distance < nearest && (j === last || facing(normals, v, j) < OPPOSED)) (nearest = distance), (other = j);
-      }
-    }
-    const o = 3 * other, rx = points[o] + shifts[o] - x, ry = points[o + 1] + shifts[o + 1] - y;
-    const depth = rx * normals[o] + ry * normals[o + 1] + (points[o + 2] + shifts[o + 2] - z) * normals[o + 2];
+    if (others[v] < 0) continue;
+    const { other, squared, depth } = nearestNow(contact, points, v), o = 3 * other;
     const both = give[v] + give[other];
-    if (depth <= -PUSH || nearest - depth * depth >= ASIDE * ASIDE || both <= 0) continue;
+    if (depth <= -PUSH || squared - depth * depth >= ASIDE * ASIDE || both <= 0) continue;
     const length = ((depth + PUSH) * give[v]) / both;
     for (let k = 0; k < 3; k++) wanted[4 * v + k] = length * normals[o + k];
     wanted[4 * v + 3] = 1;

@@ -9,6 +9,7 @@ const SAME_VIEW = Math.cos((10 * Math.PI) / 180), OTHER_VIEW = Math.cos((35 * Ma
 const SAME_SKY = 0.08, OTHER_SKY = 0.25; // changes of the share of the sky that skin sees, as in avatar/pose.py
 const SAME_BESIDE = 0.02, OTHER_BESIDE = 0.08; // the same where the photo is in doubt
 const IN_HOLLOWS = [1, 1.2, 1.35], LEAST_LIGHT = [0.05, 0.02, 0.01]; // of light in hollows, as in avatar/sky.py
+const IN_CREVICES = [0.03, 0.012, 0.008], DEEP_INSIDE = 0.4, OUTSIDE = 0.6; // of light close to other skin, as there
 const CLOSED = (15 * Math.PI) / 180, OPENED = (75 * Math.PI) / 180; // flexions between which folds open, as in avatar/folds.py
 const NO_JOINT = 255; // of Gaussians that have no folds
 const WEAK = 0.3, DEEP = 0.6; // differences of shade from 1, up to which it is the skin's own, and from which it is not
@@ -73,15 +74,16 @@ function lightVertices(body, shading, light, viewed) {
     const same = mixed(SAME_SKY, SAME_BESIDE), other = mixed(OTHER_SKY, OTHER_BESIDE);
     const left = (moved) => viewed * (albedo && seen ? kept * (1 - between(moved, same, other)) : kept);
     deep[v] = held * left(nearby[v]);
-    lightVertex(light, bounce, x, y, z, sky.exposure, factors, 4 * v);
+    lightVertex(light, bounce, x, y, z, sky.exposure, body.contact.closeness[v], factors, 4 * v);
     if (shade) for (let c = 0; c < 3; c++) factors[4 * v + c] *= 1 + deep[v] * (shade[3 * v + c] - 1);
     factors[4 * v + 3] = left(mixed(change[v], nearby[v]));
   }
 }
 
-// Factors of colours that face (x, y, z), past what is hidden of the light there.
-function lightVertex({ harmonics: h, limits }, bounce, x, y, z, exposure, factors, at) {
+// Factors of colours that face (x, y, z), past what is hidden of the light there, this close to other skin.
+function lightVertex({ harmonics: h, limits }, bounce, x, y, z, exposure, closeness, factors, at) {
   const xy = x * y, yz = y * z, zz = 3 * z * z - 1, xz = x * z, xx = x * x - y * y;
+  const hidden = bounce ? closeness * between(OUTSIDE - exposure[at], 0, OUTSIDE - DEEP_INSIDE) : 0;
   for (let c = 0; c < 3; c++) {
     let got = h[c] + h[3 + c] * x + h[6 + c] * y + h[9 + c] * z + h[12 + c] * xy + h[15 + c] * yz + h[18 + c] * zz +
       h[21 + c] * xz + h[24 + c] * xx;
@@ -90,6 +92,7 @@ function lightVertex({ harmonics: h, limits }, bounce, x, y, z, exposure, factor
       const e = exposure[at + 1 + c], [p, q, r] = bounce[c];
       const bounced = Math.max(e, ((e * p + q) * e + r) * e); // Jimenez et al. 2016
       got *= LEAST_LIGHT[c] + (1 - LEAST_LIGHT[c]) * bounced ** IN_HOLLOWS[c];
+      got *= 1 - hidden * (1 - IN_CREVICES[c]);
     }
     factors[at + c] = got ** (1 / GAMMA);
   }
