@@ -23,7 +23,7 @@ from oasis_warp.cli.serve import MAX_BYTES, FormServer
 from oasis_warp.cli.view import PageServer
 from oasis_warp.core.errors import InputError
 from oasis_warp.export import export_avatar
-from oasis_warp.export.page_file import unpack_data
+from oasis_warp.export.page_data import unpack_data
 
 
 @pytest.fixture

@@ -24,7 +24,8 @@ from oasis_warp.avatar.sky import studio_light
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.data.splat_files import read_splats
 from oasis_warp.export import export_avatar
-from oasis_warp.export.page_file import joint_sliders, page_html, splats_html, unpack_data
+from oasis_warp.export.page_data import joint_sliders, unpack_data
+from oasis_warp.export.page_file import page_html, splats_html
 from oasis_warp.hand import skinning as hand_skinning
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
 from oasis_warp.ops import bone_transforms, skin

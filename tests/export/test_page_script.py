@@ -16,7 +16,8 @@ from oasis_kernels import constants
 from oasis_warp.avatar import pose
 from oasis_warp.avatar.sky import studio_light
 from oasis_warp.core.camera import ORBIT_FIELD_OF_VIEW, orbit_camera
-from oasis_warp.export.page_file import NO_JOINT, page_html, page_text, unpack_data
+from oasis_warp.export.page_data import NO_JOINT, unpack_data
+from oasis_warp.export.page_file import page_html, page_text
 from oasis_warp.ops import contact, sky_exposure
 from oasis_warp.reference import posing
 

@@ -32,7 +32,7 @@ from oasis_warp.datasets.samples import load_picture
 from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.estimation.keypoints import read_keypoints
 from oasis_warp.export import export_avatar
-from oasis_warp.export.page_file import splat_facts
+from oasis_warp.export.page_data import splat_facts
 from oasis_warp.hand.mano import read_mano
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.template import bundled_hand
