@@ -98,6 +98,8 @@ PIPELINE = [
     _of("avatar/folds", "avatar/test_folds", "straight_ones", "seen and painted folds swapped",
         "seen, painted = of_photo * (1 - folds.painted), of_straight * folds.painted",
         "seen, painted = of_straight * (1 - folds.painted), of_photo * folds.painted"),
+    _of("avatar/creases", "avatar/test_creases", "where_it_is_stretched", "creases go flat where skin is squeezed",
+        "(_coarse_areas(posed) / creases.areas).log()", "(creases.areas / _coarse_areas(posed)).log()"),
     _of("avatar/folds", "avatar/test_folds", "paler_and_warmer", "brown spots stay of opened folds",
         "(around - logs).clamp(0, MOST)", "0 * (around - logs)"),
     _of("avatar/folds", "avatar/test_folds", "stays_straight", "one finger's bend changes the whole back",

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from oasis_warp.avatar.creases import Creases, find_creases
 from oasis_warp.avatar.folds import Folds, find_folds, open_folds
 from oasis_warp.avatar.pose import (
     GAMMA,
@@ -67,6 +68,8 @@ class AvatarParts(NamedTuple):
     light: SurfaceLight | None
     folds: Folds | None
     """Which open in `light` when fingers bend."""
+    creases: Creases | None
+    """Which go flat in `light` when skin is stretched."""
 
 
 class Avatar:
@@ -119,13 +122,15 @@ class Avatar:
         self._canonical = mirror_canonical(gaussians) if left else gaussians
         vertices = self._rest.vertices
         self._rest_mesh = vertices if vertices.requires_grad else rest_mesh(vertices, self.hand.faces, validate=False)
-        self._light = self._folds = None
+        self._light = self._folds = self._creases = None
         if light is not None:
             camera = mirror_camera(source_camera) if left else source_camera
             center = camera_center(camera.viewmat.to(vertices))
-            known = with_photo(light, self.rest.vertices, self._photo_surface(), self.hand.faces, center)
+            photo = self._photo_surface()
+            known = with_photo(light, self.rest.vertices, photo, self.hand.faces, center)
             self._light = mirror_surface_light(known) if left else known
             self._folds = find_folds(self.hand, gaussians, invented, source_pose.angles.to(vertices))
+            self._creases = find_creases(self.hand, gaussians, invented, photo, self._folds)
         self._fixed = *(part for part in self._canonical if part is not None), vertices, self._rest.joints
         self._source_angles = source_pose.angles.to(self.shape)
         self._graphs = GraphCache()
@@ -144,7 +149,7 @@ class Avatar:
     @property
     def parts(self) -> AvatarParts:
         """The inputs of `pose`, for programs with a posing of their own."""
-        return AvatarParts(self._model, self._rest, self._canonical, self._light, self._folds)
+        return AvatarParts(self._model, self._rest, self._canonical, self._light, self._folds, self._creases)
 
     @property
     def device(self) -> torch.device:
@@ -225,7 +230,7 @@ class Avatar:
         opening = None if self._folds is None else open_folds(self._folds, checked.angles)
         return pose_gaussians(
             self._canonical, self.hand.faces, self._rest_mesh, posed.vertices, self._light, center, opening,
-            posed.closeness,
+            posed.closeness, self._creases,
         )  # fmt: skip
 
     def render(

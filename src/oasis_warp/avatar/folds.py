@@ -200,14 +200,19 @@ def _relief_of_back(skin: _BackSkin, logs: Float[Tensor, "B 3"]) -> Float[Tensor
     """What a fist adds to the back, and the share of skin that it changes: all but ink."""
     around = surface.smooth_over_mesh(logs, skin.edges, HOLLOW_PASSES)
     beyond = logs - around
-    depth = beyond.mean(1, keepdim=True).abs().clamp_min(1e-6)
+    depth = beyond.mean(1, keepdim=True).abs()
     low, high = INK
     ink = ((depth - low) / (high - low)).clamp(0, 1)
     ink = (INK_PASSES * surface.smooth_over_mesh(ink, skin.edges, INK_PASSES)).clamp(max=1)
     share = skin.share[:, None].to(logs) * (1 - ink)
-    deep = 1 - SHALLOW * torch.tanh(depth / SHALLOW) / depth
     knuckles = skin.knuckles.to(logs) @ logs.new_tensor([BLANCHED, VALLEY])
-    return torch.cat([(knuckles - deep * beyond) * share, share], 1)
+    return torch.cat([(knuckles - beyond_shallow(beyond, SHALLOW)) * share, share], 1)
+
+
+def beyond_shallow(logs: Float[Tensor, "S 3"], shallow: float) -> Float[Tensor, "S 3"]:
+    """What must go of logarithms of colours for their mean to tend to `shallow`."""
+    depth = logs.mean(1, keepdim=True).abs().clamp_min(1e-6)
+    return logs * (1 - shallow * torch.tanh(depth / shallow) / depth)
 
 
 class Opening(NamedTuple):

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from oasis_warp.avatar.anchors import vertex_to_gaussians
+from oasis_warp.avatar.creases import Creases, flat_share
 from oasis_warp.avatar.folds import Opening
 from oasis_warp.avatar.sky import arriving, arriving_before, exposure, harmonic_basis, in_crevices, largest_nearby
 from oasis_warp.core import rotation, surface
@@ -224,8 +225,13 @@ def _opened(
     if opening is None:
         return factors
     gone = 1 if stays is None else 1 - stays.index_select(-2, opening.index)
-    logs = opening.logs + opening.painted * gone
-    return factors.index_copy(-2, opening.index, factors.index_select(-2, opening.index) * logs.exp())
+    return _times_exp(factors, opening.index, opening.logs + opening.painted * gone)
+
+
+def _times_exp(
+    factors: Float[Tensor, "*B N 3"], index: Int[Tensor, "M"], logs: Float[Tensor, "*B M 3"]
+) -> Float[Tensor, "*B N 3"]:
+    return factors.index_copy(-2, index, factors.index_select(-2, index) * logs.exp())
 
 
 def _at_gaussians(
@@ -301,6 +307,7 @@ def pose_gaussians(
     center: Float[Tensor, "3"] | None = None,
     opening: Opening | None = None,
     closeness: Float[Tensor, "*B V"] | None = None,
+    creases: Creases | None = None,
 ) -> Gaussians:
     """Gaussians that follow the surface from `rest_vertices` to `posed_vertices` (the paper's appendix B.1).
 
@@ -311,7 +318,7 @@ def pose_gaussians(
     have the colours: they are drawn in it, without the part that the posed surface hides. With the `center` of a
     camera, shade fades as that camera leaves the side of the photo; without, it is as the photo's camera saw it. With
     an `opening`, folds over bent joints are open in that light. With the `closeness` of the `posed_vertices` to other
-    skin, little light comes between fingers that touch.
+    skin, little light comes between fingers that touch. With `creases`, those in stretched skin are flat.
     """
     means, quats, scales, vertex_quats = pose_mesh_gaussians(
         rest_vertices, posed_vertices, faces, canonical.face_index, canonical.barycentrics, canonical.vertex_index,
@@ -324,5 +331,9 @@ def pose_gaussians(
         if center is not None and light.photo_view is not None:
             viewed = view_share(light.photo_view, view_direction(posed_vertices, center))
         factors = shading_factors(canonical, faces, light.light, on, light.seen, viewed, opening)
+        if creases is not None:
+            flat = _at_gaussians(flat_share(creases, posed_vertices)[..., None], faces, canonical)
+            logs = flat.index_select(-2, creases.index) * creases.change
+            factors = _times_exp(factors, creases.index, logs)
         colors = (colors * factors).clamp(0, 1)
     return Gaussians(means, quats, scales, canonical.opacities, colors)

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from oasis_warp.avatar.creases import Creases
 from oasis_warp.avatar.folds import Folds
 from oasis_warp.avatar.pose import GAMMA, SurfaceLight
 from oasis_warp.avatar.sky import sky_mesh, studio_light
@@ -42,8 +43,8 @@ WALK_FRAMES, WALK_SECONDS = 12, 7.5
 """Frames from one of them to the next, which the page blends, and length of the motion."""
 
 
-NO_JOINT = 255
-"""Number of the joint of Gaussians without folds."""
+NO_JOINT, STRETCH = 255, 254
+"""Numbers of the joint of Gaussians that have no folds, and of those with creases, which depend on no joint."""
 MAX_SHORTS, FEW_STEPS = 45, 63
 """Correctives that have 16 bits: three for each joint. MANO's 135 have so many steps to either side, to within .1 mm in
 all: 16 bits would fill 13 MB of the page."""
@@ -71,8 +72,8 @@ def page_facts(
     poses |= {name: avatar.held(name).angles.cpu() for name in POSE_NAMES}
     lights = {} if parts.light is None else {"photo": parts.light}
     in_studio = avatar.in_light(studio_light()).parts
-    studio, folds = in_studio.light, in_studio.folds
-    assert studio is not None and folds is not None, "in_light gives them"
+    studio, folds, creases = in_studio.light, in_studio.folds, in_studio.creases
+    assert studio is not None and folds is not None and creases is not None, "in_light gives them"
     lights["studio"] = studio
     begin = poses["photo"] if angles is None else angles.cpu()
     *reached, at_start = _reached(avatar, [*poses.values(), begin])
@@ -105,7 +106,7 @@ def page_facts(
         },
         "hasInvented": avatar.invented is not None,
     }
-    return facts, _arrays(avatar, studio if parts.light is None else parts.light, folds)
+    return facts, _arrays(avatar, studio if parts.light is None else parts.light, folds, creases)
 
 
 def splat_facts(gaussians: Gaussians) -> tuple[dict[str, Any], dict[str, np.ndarray | Packed]]:
@@ -188,8 +189,8 @@ def _middle(vertices: Float[Tensor, "N 3"]) -> Float[Tensor, "3"]:
 
 
 @torch.no_grad()
-def _arrays(avatar: Avatar, light: SurfaceLight, folds: Folds) -> dict[str, np.ndarray | Packed]:
-    hand, rest, gaussians, own_light, _ = avatar.parts
+def _arrays(avatar: Avatar, light: SurfaceLight, folds: Folds, creases: Creases) -> dict[str, np.ndarray | Packed]:
+    hand, rest, gaussians, own_light, *_ = avatar.parts
     normals = surface.vertex_normals(avatar.rest.vertices, avatar.hand.faces)
     sky, mesh = sky_directions(torch.device("cpu")), sky_mesh(torch.device("cpu"))
     even = torch.ones(3) if own_light is None else own_light.light.even.cpu() ** (1 / GAMMA)
@@ -228,8 +229,9 @@ def _arrays(avatar: Avatar, light: SurfaceLight, folds: Folds) -> dict[str, np.n
         "skyDirections": _numpy(sky.directions, "f4"),
         "skyAxes": _numpy(sky.axes, "f4"),
         "skyWeights": _numpy(sky.weights, "f4"),
+        "creaseAreas": _numpy(creases.areas, "f4"),
     }
-    arrays |= _fold_arrays(folds, len(gaussians.colors))
+    arrays |= _fold_arrays(folds, creases, len(gaussians.colors))
     if light.light.facing is not None:
         arrays["facing"] = _pack(light.light.facing, "i2", 1.0)
     if light.light.shade is not None:
@@ -245,11 +247,13 @@ def _arrays(avatar: Avatar, light: SurfaceLight, folds: Folds) -> dict[str, np.n
     return arrays
 
 
-def _fold_arrays(folds: Folds, count: int) -> dict[str, np.ndarray | Packed]:
-    """Folds as values of all Gaussians; those without have `NO_JOINT`."""
+def _fold_arrays(folds: Folds, creases: Creases, count: int) -> dict[str, np.ndarray | Packed]:
+    """Folds and creases as values of all Gaussians: these have `STRETCH` as joint, those without either `NO_JOINT`."""
     change = folds.change.new_zeros(count, 3).index_copy(0, folds.index, folds.change)
+    change = change.index_copy(0, creases.index, creases.change)
     between = folds.between.new_zeros(count, 1).index_copy(0, folds.index, folds.between)
     joints = folds.joints.new_full((count, 2), NO_JOINT).index_copy(0, folds.index, folds.joints)
+    joints = joints.index_fill(0, creases.index, STRETCH)
     return {
         "folds": _pack(change, "i1", 1.0), "foldJoints": _numpy(joints, "u1"), "foldBetween": _pack(between, "u1", 1.0)
     }  # fmt: skip

@@ -11,7 +11,8 @@ const SAME_BESIDE = 0.02, OTHER_BESIDE = 0.08; // the same where the photo is in
 const IN_HOLLOWS = [1, 1.2, 1.35], LEAST_LIGHT = [0.05, 0.02, 0.01]; // of light in hollows, as in avatar/sky.py
 const IN_CREVICES = [0.03, 0.012, 0.008], DEEP_INSIDE = 0.4, OUTSIDE = 0.6; // of light close to other skin, as there
 const CLOSED = (15 * Math.PI) / 180, OPENED = (75 * Math.PI) / 180; // flexions between which folds open, as in avatar/folds.py
-const NO_JOINT = 255; // of Gaussians that have no folds
+const UNSTRETCHED = 0.05, STRETCHED = 0.25; // logarithms of growth between which creases go flat, as in avatar/creases.py
+const NO_JOINT = 255, STRETCH = 254; // of Gaussians that have no folds, and of those with creases
 const WEAK = 0.3, DEEP = 0.6; // differences of shade from 1, up to which it is the skin's own, and from which it is not
 const MAP_SEEN = [0.36, 0.6, 0.57], MAP_INVENTED = [0.89, 0.55, 0.28], MAP_SKIN = 0.35; // colours of the map; share of skin in it
 
@@ -21,6 +22,7 @@ function makeShading(body, { count }) {
     normals: new Float32Array(3 * n), factors: new Float32Array(4 * n), change: new Float32Array(n), nearby: new Float32Array(n),
     deep: new Float32Array(n), colors: new Uint32Array(count), sky: makeSky(body),
     opened: new Float32Array(2 * (body.nBones - 1)), // of each joint, the share of seen folds that is open, and of painted ones
+    stretched: new Float32Array(n), // share of each vertex's creases that is flat
   };
 }
 
@@ -32,6 +34,23 @@ function openFolds(body, { opened }, angles) {
   for (let j = 0; j < straight.length; j++) {
     opened[2 * j] = between(angles[3 * j] - photo[j], CLOSED, OPENED);
     opened[2 * j + 1] = between(angles[3 * j] - straight[j], CLOSED, OPENED);
+  }
+}
+
+// How far the pose stretches skin since the photo: the growth of the coarse faces around each vertex.
+function flattenCreases({ posed, nVertices, data: { arrays } }, { stretched }) {
+  const { skyVertices, skyFaces, skyCorners, skyShares, creaseAreas } = arrays, areas = new Float64Array(skyVertices.length);
+  const point = (v) => posed.subarray(3 * skyVertices[v], 3 * skyVertices[v] + 3);
+  for (let f = 0; f < skyFaces.length; f += 3) {
+    const [a, b, c] = [point(skyFaces[f]), point(skyFaces[f + 1]), point(skyFaces[f + 2])];
+    const ux = b[0] - a[0], uy = b[1] - a[1], uz = b[2] - a[2], vx = c[0] - a[0], vy = c[1] - a[1], vz = c[2] - a[2];
+    const area = Math.hypot(uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx) / 2;
+    for (let k = f; k < f + 3; k++) areas[skyFaces[k]] += area;
+  }
+  for (let v = 0; v < nVertices; v++) {
+    let grown = 0;
+    for (let k = 3 * v; k < 3 * v + 3; k++) grown += skyShares[k] * Math.log(areas[skyCorners[k]] / creaseAreas[skyCorners[k]]);
+    stretched[v] = between(grown, UNSTRETCHED, STRETCHED);
   }
 }
 
@@ -102,14 +121,16 @@ function lightVertex({ harmonics: h, limits }, bounce, x, y, z, exposure, closen
 function colorGaussians(body, gaussians, shading, light) {
   const { colors: own, fineShade, even, folds, foldJoints, foldBetween, invented } = body.data.arrays;
   const { count, corners, shares, heaviest, shown, opacities } = gaussians;
-  const { factors, colors, deep, opened } = shading;
+  const { factors, colors, deep, opened, stretched } = shading;
   for (let i = 0; i < count; i++) {
     if (!shown[heaviest[i]]) continue;
     const a = 3 * i, p = shares[a], q = shares[a + 1], r = shares[a + 2];
     const u = 4 * corners[a], v = 4 * corners[a + 1], w = 4 * corners[a + 2];
     const weak = light ? p * factors[u + 3] + q * factors[v + 3] + r * factors[w + 3] : 1;
     let stays = 0, open = 0, seenOpen = 0;
-    if (light && foldJoints[2 * i] < NO_JOINT) {
+    if (light && foldJoints[2 * i] === STRETCH) {
+      open = p * stretched[corners[a]] + q * stretched[corners[a + 1]] + r * stretched[corners[a + 2]];
+    } else if (light && foldJoints[2 * i] < NO_JOINT) {
       const painted = invented ? p * invented[corners[a]] + q * invented[corners[a + 1]] + r * invented[corners[a + 2]] : 0;
       const j = 2 * foldJoints[2 * i], k = 2 * foldJoints[2 * i + 1], t = foldBetween[i];
       seenOpen = (1 - painted) * (opened[j] + t * (opened[k] - opened[j]));

@@ -22,6 +22,7 @@ function poseHand({ body, shading }, angles) {
   rotateVertices(body);
   turnWithVertices(body.quats, body.data.arrays.normals, shading.normals);
   openFolds(body, shading, angles);
+  flattenCreases(body, shading);
 }
 
 // In even light and on the map colours do not depend on the pose.
