@@ -70,7 +70,7 @@ def measure_pose(pose: str, gesture: torch.Tensor | None, shapes: torch.Tensor) 
     for number, shape in enumerate(shapes):
         angles = named_pose(hand, pose, rest_hand(hand, shape)) if gesture is None else gesture
         surfaces = {"skinned": posed(hand, angles, shape).vertices}
-        surfaces["contact"] = resolve_contact(hand, surfaces["skinned"])
+        surfaces["contact"] = resolve_contact(hand, surfaces["skinned"]).vertices
         if number == 0:
             surfaces["plain"] = posed(without_correctives(hand), angles, shape).vertices
         row: Row = {"pose": pose, "hand": number}
@@ -132,7 +132,7 @@ def draw(rows: list[Row], static: Path) -> None:
     for name in POSE_NAMES:
         angles = named_pose(hand, name)
         plain, full = (posed(model, angles, mean_hand) for model in (without_correctives(hand), hand))
-        full = full._replace(vertices=resolve_contact(hand, full.vertices))
+        full = full._replace(vertices=resolve_contact(hand, full.vertices).vertices)
         strips.append(views(full, name, side))
         if name in CORRECTED_POSES:
             pairs.append(views(plain, f"{name}, before", side) + views(full, "after", side))

@@ -343,6 +343,8 @@ def test_the_fist_of_an_avatar_is_darker_between_its_fingers(hand, monkeypatch):
     monkeypatch.setattr(posing, "in_crevices", lambda closeness, exposure: torch.ones_like(exposure[..., 1:]))
     change = (dark / avatar.pose("fist").colors)[: len(truth.vertex_index), 1]
     pose = avatar.held("fist")
-    closeness = resolve_contact(hand, skin_surface(hand, avatar.rest, pose)).closeness[truth.vertex_index]
+    closeness = resolve_contact(hand, skin_surface(hand, avatar.rest, pose)).closeness
+    assert closeness is not None
+    closeness = closeness[truth.vertex_index]
     assert float(change[closeness > 0.5].median()) < 0.9
     assert float(change[closeness == 0].quantile(0.1)) == 1

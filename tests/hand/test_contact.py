@@ -85,7 +85,9 @@ def test_near_the_photos_pose_skin_gives_way_in_part(hand, fist, led_out, device
 
 def test_closeness_is_that_to_skin_that_faces(hand, fist, led_out, device):
     """Against every vertex of other bones."""
-    closeness = resolve_contact(hand.to(device), fist.to(device)).closeness.cpu()
+    closeness = resolve_contact(hand.to(device), fist.to(device)).closeness
+    assert closeness is not None
+    closeness = closeness.cpu()
     near = closeness > 0
     assert 0.1 < float(near.float().mean()) < 0.6
     gaps = -CREVICE * closeness[near].log()
@@ -101,7 +103,9 @@ def test_closeness_begins_at_the_photos_pose(hand, fist, device):
     """In the photo's pose skin shows its own dark lines; a step there would be seen in motion."""
     model, surfaces = hand.to(device), torch.stack([fist] * 3).to(device)
     changes = torch.tensor([[0.0], [math.radians(0.1)], [math.radians(10)]], device=device)
-    none, little, whole = resolve_contact(model, surfaces, changes=changes).closeness.cpu()
+    closeness = resolve_contact(model, surfaces, changes=changes).closeness
+    assert closeness is not None
+    none, little, whole = closeness.cpu()
     assert float(none.amax()) == 0 and 0 < float(little.amax()) <= 0.01001 and float(whole.amax()) > 0.6
     assert resolve_contact(hand, fist, changes=torch.zeros(1)).closeness is None
 

@@ -176,3 +176,12 @@ def vertex_to_gaussians(
     corners = values.index_select(0, faces[anchors.face_index].flatten()).unflatten(0, (-1, 3))
     on_faces = (corners * anchors.barycentrics[..., None]).sum(1)
     return torch.cat([values.index_select(0, anchors.vertex_index), on_faces])
+
+
+def gaussian_corners(
+    faces: Int[Tensor, "F 3"], anchors: Anchors | CanonicalGaussians
+) -> tuple[Int[Tensor, "N 3"], Float[Tensor, "N 3"]]:
+    """Vertices and weights with which `vertex_to_gaussians` reads a field at every Gaussian."""
+    own = anchors.vertex_index[:, None].expand(-1, 3)
+    whole = torch.eye(3, dtype=anchors.barycentrics.dtype, device=own.device)[:1].expand(len(own), 3)
+    return torch.cat([own, faces[anchors.face_index]]).long(), torch.cat([whole, anchors.barycentrics])

@@ -4,6 +4,7 @@ A bent thumb bunches the skin of its ball, and bent fingers fold the palm. Kept 
 scars.
 """
 
+import functools
 from typing import NamedTuple
 
 import torch
@@ -11,9 +12,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
+from oasis_warp.avatar.anchors import gaussian_corners, vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.appearance import skin_regions
-from oasis_warp.avatar.folds import LEAST, MIN_COLOR, Folds, beyond_shallow
+from oasis_warp.avatar.folds import LEAST, MIN_COLOR, Folds, beyond_shallow, edges_among
 from oasis_warp.avatar.sky import sky_mesh
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
@@ -25,8 +26,6 @@ AS_IN_PHOTO, STRETCHED = 0.05, 0.25
 """Logarithms of the growth of areas since the photo up to which creases stay and from which they are flat."""
 SHALLOW = 0.17
 """Logarithm of colours that deep creases tend to. Crisp palm lines, which are no deeper, stay: graders missed them."""
-LEAST_SHARE = 1e-4
-"""Weight of skin of the back where a palm is smoothed."""
 
 
 class Creases(NamedTuple):
@@ -34,6 +33,10 @@ class Creases(NamedTuple):
 
     index: Int[Tensor, "M"]
     """Their numbers among all."""
+    corners: Int[Tensor, "M 3"]
+    """Vertices around each."""
+    weights: Float[Tensor, "M 3"]
+    """Theirs."""
     change: Float[Tensor, "M 3"]
     """Added to the logarithms of their colours where skin is wholly stretched."""
     areas: Float[Tensor, "C"]
@@ -57,17 +60,35 @@ def find_creases(
         photo: Vertices in the photo [m].
         folds: Those of the same avatar.
     """
-    logs = vertex_colors(gaussians, len(hand.template)).clamp_min(MIN_COLOR).log()
-    palm = (skin_regions(hand).palm * (1 - hand.nail.clamp(0, 1)))[:, None].to(logs)
-    weights = palm.clamp_min(LEAST_SHARE)
-    edges = surface.mesh_edges(hand.faces)
-    around = surface.smooth_over_mesh(torch.cat([logs * weights, weights], 1), edges, PASSES)
-    seen = palm if invented is None else palm * (1 - invented[:, None].to(palm))
-    read = vertex_to_gaussians(torch.cat([around[:, :3] / around[:, 3:], seen], 1), hand.faces, gaussians)
-    share = read[:, 3].index_fill(0, folds.index, 0)
-    index = torch.nonzero(share > LEAST)[:, 0]
+    vertex, edges, palm = _palm_skin(hand)
+    logs = vertex_colors(gaussians, len(hand.template))[vertex].clamp_min(MIN_COLOR).log()
+    palm = palm[:, None].to(logs)
+    around = surface.smooth_over_mesh(torch.cat([logs * palm, palm], 1), edges, PASSES)
+    seen = palm if invented is None else palm * (1 - invented[vertex, None].to(palm))
+    fields = torch.cat([around[:, :3] / around[:, 3:], seen], 1)
+    fields = fields.new_zeros(len(hand.template), 4).index_copy(0, vertex, fields)
+    read = vertex_to_gaussians(fields, hand.faces, gaussians)
+    index = torch.nonzero(read[:, 3].index_fill(0, folds.index, 0) > LEAST)[:, 0]
     beyond = gaussians.colors[index].clamp_min(MIN_COLOR).log() - read[index, :3]
-    return Creases(index, -beyond_shallow(beyond, SHALLOW) * share[index, None], _coarse_areas(photo))
+    corners, weights = gaussian_corners(hand.faces, gaussians)
+    change = -beyond_shallow(beyond, SHALLOW) * read[index, 3:]
+    return Creases(index, corners[index], weights[index], change, _coarse_areas(photo))
+
+
+@functools.lru_cache(4)
+@torch.inference_mode(False)
+def _palm_skin(hand: HandModel) -> tuple[Int[Tensor, "S"], Int[Tensor, "E 2"], Float[Tensor, "S"]]:
+    """Vertices of palms, edges between them by their places among these, and the share of palm of each."""
+    palm = skin_regions(hand).palm * (1 - hand.nail.clamp(0, 1))
+    vertex = torch.nonzero(palm > LEAST)[:, 0]
+    return vertex, edges_among(hand, vertex), palm[vertex]
+
+
+@torch.no_grad()
+def flat_creases(creases: Creases, posed: Float[Tensor, "*B V 3"]) -> Float[Tensor, "*B M 3"]:
+    """What a posed surface [m] adds to the logarithms of the colours of creases."""
+    share = flat_share(creases, posed)[..., creases.corners] * creases.weights
+    return share.sum(-1, keepdim=True) * creases.change
 
 
 @torch.no_grad()

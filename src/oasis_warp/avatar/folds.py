@@ -117,7 +117,7 @@ def _back_skin(hand: HandModel) -> _BackSkin:
         for middles, size in ((heads, HEAD), ((heads[1:] + heads[:-1]) / 2, BETWEEN))
     ]
     rows = joints[torch.stack([first, first + 1], 1)] - 1
-    return _BackSkin(vertex, _edges_among(hand, vertex), share[vertex], torch.stack(bumps, 1), rows, between)
+    return _BackSkin(vertex, edges_among(hand, vertex), share[vertex], torch.stack(bumps, 1), rows, between)
 
 
 def _back_share(hand: HandModel, joints: Int[Tensor, "4"]) -> Float[Tensor, "V"]:
@@ -140,10 +140,10 @@ def _joint_skin(hand: HandModel) -> _JointSkin:
     vertex = torch.nonzero(outer)[:, 0]
     fold = (REACH * regions.knuckle).clamp(max=1)[vertex]
     row = torch.where(outer, joint - 1, -1).long()
-    return _JointSkin(vertex, _edges_among(hand, vertex), fold, 1 - regions.nail[vertex], row)
+    return _JointSkin(vertex, edges_among(hand, vertex), fold, 1 - regions.nail[vertex], row)
 
 
-def _edges_among(hand: HandModel, vertex: Int[Tensor, "S"]) -> Int[Tensor, "E 2"]:
+def edges_among(hand: HandModel, vertex: Int[Tensor, "S"]) -> Int[Tensor, "E 2"]:
     """Edges between these vertices, by their places among them."""
     place = torch.full_like(hand.segment, -1).index_copy(0, vertex, torch.arange(len(vertex)).to(hand.segment))
     edges = place[surface.mesh_edges(hand.faces)].long()

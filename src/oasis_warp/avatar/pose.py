@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from oasis_warp.avatar.anchors import vertex_to_gaussians
-from oasis_warp.avatar.creases import Creases, flat_share
+from oasis_warp.avatar.creases import Creases, flat_creases
 from oasis_warp.avatar.folds import Opening
 from oasis_warp.avatar.sky import arriving, arriving_before, exposure, harmonic_basis, in_crevices, largest_nearby
 from oasis_warp.core import rotation, surface
@@ -332,8 +332,6 @@ def pose_gaussians(
             viewed = view_share(light.photo_view, view_direction(posed_vertices, center))
         factors = shading_factors(canonical, faces, light.light, on, light.seen, viewed, opening)
         if creases is not None:
-            flat = _at_gaussians(flat_share(creases, posed_vertices)[..., None], faces, canonical)
-            logs = flat.index_select(-2, creases.index) * creases.change
-            factors = _times_exp(factors, creases.index, logs)
+            factors = _times_exp(factors, creases.index, flat_creases(creases, posed_vertices))
         colors = (colors * factors).clamp(0, 1)
     return Gaussians(means, quats, scales, canonical.opacities, colors)
