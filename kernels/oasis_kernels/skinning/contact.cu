@@ -2,7 +2,8 @@
 //
 // `boxes` (parts, then a thread per vertex for normals) -> `meetings` (parts; a lane for each part of a group) ->
 // `find` (vertices; a lane for each part or vertex of a part) -> rounds of `contacts` and `spread` (vertices; `LANES`
-// lanes for the neighbours) -> `closeness`. Of two vertices equally near, the one that stands first is taken, as on the CPU.
+// lanes for the neighbours) -> `closeness`. Of two vertices equally near, the one that stands first is taken, as on the
+// CPU.
 
 __global__ void boxes(
 #include "contact_parameters.inc"
