@@ -36,6 +36,15 @@ def test_creases_of_the_palm_are_found_up_to_shallow_ones(hand, creased):
     assert not torch.isin(creases.index, creased.parts.folds.index).any()
 
 
+def test_ink_on_a_palm_stays(hand, creased):
+    """A word on a palm would fade as the hand opens."""
+    dark = creased.gaussians.colors < 0.32
+    colors = torch.where(dark, 0.08, creased.gaussians.colors)
+    inked = creased.with_looks(creased.gaussians._replace(colors=colors), creased.light)
+    of_lines, of_ink = (int(dark[creases_of(avatar).index, 0].sum()) for avatar in (creased, inked))
+    assert of_lines > 100 and of_ink < of_lines / 10
+
+
 def test_skin_is_flat_where_it_is_stretched_and_as_in_the_photo_in_its_pose(creased):
     """Skin that a bent thumb had bunched was a lump of putty on an open hand."""
     creases, photo, opened = creases_of(creased), creased._photo_surface(), creased.mesh("open").vertices

@@ -14,7 +14,7 @@ from torch.nn.functional import pad
 
 from oasis_warp.avatar.anchors import gaussian_corners, vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.appearance import skin_regions
-from oasis_warp.avatar.folds import LEAST, MIN_COLOR, Folds, beyond_shallow, edges_among
+from oasis_warp.avatar.folds import LEAST, MIN_COLOR, Folds, beyond_shallow, edges_among, ink_share
 from oasis_warp.avatar.sky import sky_mesh
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
@@ -51,7 +51,7 @@ def find_creases(
     photo: Float[Tensor, "V 3"],
     folds: Folds,
 ) -> Creases:
-    """Creases of the palm as far as the photo shows it.
+    """Creases of the palm as far as the photo shows it; ink is none.
 
     Args:
         hand: Model of the surface.
@@ -64,8 +64,9 @@ def find_creases(
     logs = vertex_colors(gaussians, len(hand.template))[vertex].clamp_min(MIN_COLOR).log()
     palm = palm[:, None].to(logs)
     around = surface.smooth_over_mesh(torch.cat([logs * palm, palm], 1), edges, PASSES)
+    around = around[:, :3] / around[:, 3:]
     seen = palm if invented is None else palm * (1 - invented[vertex, None].to(palm))
-    fields = torch.cat([around[:, :3] / around[:, 3:], seen], 1)
+    fields = torch.cat([around, seen * (1 - ink_share(logs - around, edges))], 1)
     fields = fields.new_zeros(len(hand.template), 4).index_copy(0, vertex, fields)
     read = vertex_to_gaussians(fields, hand.faces, gaussians)
     index = torch.nonzero(read[:, 3].index_fill(0, folds.index, 0) > LEAST)[:, 0]

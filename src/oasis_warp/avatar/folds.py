@@ -40,7 +40,7 @@ BLANCHED, VALLEY = (0.07, 0.11, 0.11), (-0.06, -0.09, -0.09)
 HEAD, BETWEEN = 0.007, 0.005
 """Radii of both [m]."""
 INK, INK_PASSES = (0.5, 0.7), 6
-"""Mean logarithms by which a place differs from the smoothed back, from which on it may be ink and from which it is,
+"""Mean logarithms by which a place differs from the smoothed skin, from which on it may be ink and from which it is,
 and smoothings that carry this to what is beside."""
 BACK_ENDS = (-0.015, -0.035)
 """Distances to the wrist, along the hand, at which the back's relief begins to go and from which all goes [m]."""
@@ -200,13 +200,16 @@ def _relief_of_back(skin: _BackSkin, logs: Float[Tensor, "B 3"]) -> Float[Tensor
     """What a fist adds to the back, and the share of skin that it changes: all but ink."""
     around = surface.smooth_over_mesh(logs, skin.edges, HOLLOW_PASSES)
     beyond = logs - around
-    depth = beyond.mean(1, keepdim=True).abs()
-    low, high = INK
-    ink = ((depth - low) / (high - low)).clamp(0, 1)
-    ink = (INK_PASSES * surface.smooth_over_mesh(ink, skin.edges, INK_PASSES)).clamp(max=1)
-    share = skin.share[:, None].to(logs) * (1 - ink)
+    share = skin.share[:, None].to(logs) * (1 - ink_share(beyond, skin.edges))
     knuckles = skin.knuckles.to(logs) @ logs.new_tensor([BLANCHED, VALLEY])
     return torch.cat([(knuckles - beyond_shallow(beyond, SHALLOW)) * share, share], 1)
+
+
+def ink_share(beyond: Float[Tensor, "S 3"], edges: Int[Tensor, "E 2"]) -> Float[Tensor, "S 1"]:
+    """Share of ink of vertices whose logarithms of colours differ so much from those of the skin around."""
+    low, high = INK
+    ink = ((beyond.mean(1, keepdim=True).abs() - low) / (high - low)).clamp(0, 1)
+    return (INK_PASSES * surface.smooth_over_mesh(ink, edges, INK_PASSES)).clamp(max=1)
 
 
 def beyond_shallow(logs: Float[Tensor, "S 3"], shallow: float) -> Float[Tensor, "S 3"]:
