@@ -54,6 +54,8 @@ BLOOD_MEAN = 0.0125
 """Blood share of the back of the hand; one value serves the whole range of tones."""
 PALM_SMOOTHING = 5
 """Passes over the mesh that soften the border between palm and back."""
+PALM_BORDER = (0.36, 0.74)
+"""Shares of what faces the palm, thus smoothed, between which skin changes from that of backs to that of palms."""
 BALL_PASSES, AT_BALL = 120, 1.5
 """Passes that smooth this border beside the ball of the thumb, 20 mm, and the factor of where that is."""
 WRIST_END = (-0.009, 0.009)
@@ -102,9 +104,8 @@ def _bump(x: Tensor, center: float, width: float) -> Tensor:
 def label_regions(hand: HandModel) -> Regions:
     """Soft region labels from the model's bone coordinates; kept, so not to be written to."""
     edges = surface.mesh_edges(hand.faces)
-    toward_palm = 0.5 - 0.5 * torch.cos(hand.bone_theta)
-    palm = surface.smooth_over_mesh(toward_palm[:, None], edges, PALM_SMOOTHING)[:, 0]
-    palm = _smoothstep(palm, 0.36, 0.74)
+    palm = surface.smooth_over_mesh(_toward_palm(hand)[:, None], edges, PALM_SMOOTHING)[:, 0]
+    palm = _smoothstep(palm, *PALM_BORDER)
     level = torch.where(hand.segment == 0, 0, (hand.segment - 1) % 3 + 1)  # 0 hand, 1 to 3 along a finger
     on_finger = level > 0
     tip = torch.where(level == 3, _smoothstep(hand.bone_t, 0.35, 0.8), 0)
@@ -123,6 +124,11 @@ def label_regions(hand: HandModel) -> Regions:
     )
 
 
+def _toward_palm(hand: HandModel) -> Float[Tensor, "V"]:
+    """0 on the back of each vertex's bone, 1 on its palm's side."""
+    return 0.5 - 0.5 * torch.cos(hand.bone_theta)
+
+
 @functools.lru_cache(4)
 @torch.inference_mode(False)
 def skin_regions(hand: HandModel) -> Regions:
@@ -132,12 +138,11 @@ def skin_regions(hand: HandModel) -> Regions:
     painted, it was a stain. This border crosses the ball in one line, and the wrist's skin is that of a back.
     """
     edges = surface.mesh_edges(hand.faces)
-    toward_palm = 0.5 - 0.5 * torch.cos(hand.bone_theta)
-    ball = (hand.segment == TIP_JOINTS[0] - 2).to(toward_palm)
-    wide, share = surface.smooth_over_mesh(torch.stack([toward_palm, ball], 1), edges, BALL_PASSES).unbind(1)
-    own = surface.smooth_over_mesh(toward_palm[:, None], edges, PALM_SMOOTHING)[:, 0]
+    both = torch.stack([_toward_palm(hand), (hand.segment == TIP_JOINTS[0] - 2).float()], 1)
+    near = surface.smooth_over_mesh(both, edges, PALM_SMOOTHING)
+    wide, share = surface.smooth_over_mesh(near, edges, BALL_PASSES - PALM_SMOOTHING).unbind(1)
     beside = (AT_BALL * 4 * share * (1 - share)).clamp(max=1)
-    palm = _smoothstep(torch.lerp(own, wide, beside), 0.36, 0.74)
+    palm = _smoothstep(torch.lerp(near[:, 0], wide, beside), *PALM_BORDER)
     palm = palm * (1 - _smoothstep(hand.template[:, 0], *WRIST_END))
     return label_regions(hand)._replace(palm=palm)
 
