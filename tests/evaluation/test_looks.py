@@ -15,7 +15,7 @@ from oasis_warp.avatar.wrist import ARM_GROWTH, ARM_LENGTH, rim_axis
 from oasis_warp.cli import evaluate, main
 from oasis_warp.core.camera import orbit_camera, project
 from oasis_warp.core.color import cielab, linear_light, luminance
-from oasis_warp.core.config import AdaptConfig
+from oasis_warp.core.config import AdaptConfig, ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.mirror import mirror_points
 from oasis_warp.data.photo import read_photo
@@ -25,6 +25,7 @@ from oasis_warp.evaluation import data_sets, paper_tables
 from oasis_warp.evaluation.band_energy import BANDS, HAZE_REACH, SIZE, darkest_over_median, haze, mean_light, redness
 from oasis_warp.evaluation.data_sets import Choice, Key, Row, Sample, choose, evaluate_data_set, misposed
 from oasis_warp.evaluation.kernel_distance import LAYERS
+from oasis_warp.evaluation.look_measures import measure_looks
 from oasis_warp.evaluation.looks import hand_of, kernel_rows, summarise_looks
 from oasis_warp.evaluation.methods import RAW
 from oasis_warp.evaluation.paper_tables import (
@@ -43,6 +44,7 @@ from oasis_warp.network.config import COMPACT, NetworkConfig
 from oasis_warp.network.hand_network import HandNetwork
 from oasis_warp.network.prior import choose_prior
 from oasis_warp.network.weights_file import save_network
+from oasis_warp.reconstruction import reconstruct
 
 
 def test_pixels_near_the_outline_of_a_finger_before_the_hand_do_not_count():
@@ -398,3 +400,13 @@ def weights_of(hand, tmp_path):
 def test_options_that_do_not_belong_together_are_refused(options, said, tmp_path, capsys):
     assert main(["evaluate", *options, "--out", str(tmp_path / "out")]) == 2
     assert said in capsys.readouterr().err
+
+
+@pytest.mark.gpu
+def test_looks_of_an_avatar_on_the_device_are_measured():
+    """The hand painted all over had its surface on the CPU and its tone on the device."""
+    photo = read_photo(Path(__file__).parents[1] / "data" / "photos" / "palm_open_left_02.png")
+    prior = choose_prior("learned")
+    made = reconstruct(photo, ReconstructConfig(device="cuda", steps=2), prior=prior)
+    looks = measure_looks(photo, made, "a", prior, 0)
+    assert looks.samples["painted"] and looks.record["contrast"]["painted_palm"]

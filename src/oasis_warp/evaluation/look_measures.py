@@ -99,7 +99,7 @@ def measure_looks(
     ]
     shown = crops[0].image.flip(1) if left else crops[0].image
     mask, first = crops[0].mask.flip(1) if left else crops[0].mask, pictures[0].image[None]
-    painted = None if made.skin is None else _draw_painted(made, made.skin, crops[0], prior, seed, pictures[0])
+    painted = None if made.skin is None else _draw_painted(photo, made, made.skin, prior, seed, pictures[0])
     record: Record = {
         "side": avatar.side,
         "input_psnr_db": made.errors["input_psnr_inner_db"],
@@ -143,10 +143,13 @@ def _draw_picture(avatar: Avatar, view: View, surface: Surface) -> Picture:
 
 
 def _draw_painted(
-    made: Reconstruction, skin: OwnSkin, crop: HandCrop, prior: Prior, seed: int, first: Picture
+    photo: Photo, made: Reconstruction, skin: OwnSkin, prior: Prior, seed: int, first: Picture
 ) -> Picture:
     """The photo's view `first`, of the same hand in the same light, painted all over."""
-    avatar, rest = made.avatar, crop.rest.vertices
+    avatar = made.avatar
+    on_device = ReconstructConfig(device="cuda" if avatar.device.type == "cuda" else "cpu")
+    crop = crop_hand(photo, made.fit, avatar.surface_offsets.cpu(), on_device, SIZE)
+    rest = crop.rest.vertices
     gaussians = paint_hand(bundled_hand(), prior(crop), rest, skin, seed=seed)
     light = None if avatar.light is None else avatar.light._replace(shade=None, facing=None, doubt=None)
     painted = make_avatar(made.fit, avatar.surface_offsets, crop, gaussians, light, torch.ones_like(rest[:, 0]))
