@@ -27,6 +27,9 @@ AS_IN_PHOTO, STRETCHED = 0.05, 0.25
 SHALLOW = 0.17
 """Logarithm of colours that deep creases tend to. Crisp palm lines, which are no deeper, stay: graders missed them."""
 
+LEAST_AREA = 1e-12
+"""Least area of which a logarithm is taken [m^2]."""
+
 
 class Creases(NamedTuple):
     """Creases at M of an avatar's Gaussians, none of which has folds."""
@@ -61,14 +64,14 @@ def find_creases(
         folds: Those of the same avatar.
     """
     vertex, edges, palm = _palm_skin(hand)
-    logs = vertex_colors(gaussians, len(hand.template))[vertex].clamp_min(MIN_COLOR).log()
-    palm = palm[:, None].to(logs)
-    around = surface.smooth_over_mesh(torch.cat([logs * palm, palm], 1), edges, PASSES)
+    logs = vertex_colors(gaussians, len(hand.template)).clamp_min(MIN_COLOR).log()
+    own, palm = logs[vertex], palm[:, None].to(logs)
+    around = surface.smooth_over_mesh(torch.cat([own * palm, palm], 1), edges, PASSES)
     around = around[:, :3] / around[:, 3:]
     seen = palm if invented is None else palm * (1 - invented[vertex, None].to(palm))
-    fields = torch.cat([around, seen * (1 - ink_share(logs - around, edges))], 1)
-    fields = fields.new_zeros(len(hand.template), 4).index_copy(0, vertex, fields)
-    read = vertex_to_gaussians(fields, hand.faces, gaussians)
+    fields = torch.cat([around, seen * (1 - ink_share(own - around, edges))], 1)
+    beside = torch.cat([logs, torch.zeros_like(logs[:, :1])], 1)  # read by Gaussians at the palm's border
+    read = vertex_to_gaussians(beside.index_copy(0, vertex, fields), hand.faces, gaussians)
     index = torch.nonzero(read[:, 3].index_fill(0, folds.index, 0) > LEAST)[:, 0]
     beyond = gaussians.colors[index].clamp_min(MIN_COLOR).log() - read[index, :3]
     corners, weights = gaussian_corners(hand.faces, gaussians)
@@ -106,4 +109,4 @@ def _coarse_areas(vertices: Float[Tensor, "*B V 3"]) -> Float[Tensor, "*B C"]:
     mesh = sky_mesh(vertices.device)
     a, b, c = vertices[..., mesh.vertices, :][..., mesh.faces, :].unbind(-2)
     areas = torch.linalg.cross(b - a, c - a).norm(dim=-1) / 2
-    return pad(areas, (0, 1))[..., mesh.vertex_faces].sum(-1)  # a zero past the last face
+    return pad(areas, (0, 1))[..., mesh.vertex_faces].sum(-1).clamp_min(LEAST_AREA)  # a zero past the last face

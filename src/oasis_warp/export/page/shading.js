@@ -12,6 +12,7 @@ const IN_HOLLOWS = [1, 1.2, 1.35], LEAST_LIGHT = [0.05, 0.02, 0.01]; // of light
 const IN_CREVICES = [0.03, 0.012, 0.008], DEEP_INSIDE = 0.4, OUTSIDE = 0.6; // of light close to other skin, as there
 const CLOSED = (15 * Math.PI) / 180, OPENED = (75 * Math.PI) / 180; // flexions between which folds open, as in avatar/folds.py
 const UNSTRETCHED = 0.05, STRETCHED = 0.25; // logarithms of growth between which creases go flat, as in avatar/creases.py
+const LEAST_AREA = 1e-12; // of which a logarithm is taken [m^2]
 const NO_JOINT = 255, STRETCH = 254; // of Gaussians that have no folds, and of those with creases
 const WEAK = 0.3, DEEP = 0.6; // differences of shade from 1, up to which it is the skin's own, and from which it is not
 const MAP_SEEN = [0.36, 0.6, 0.57], MAP_INVENTED = [0.89, 0.55, 0.28], MAP_SKIN = 0.35; // colours of the map; share of skin in it
@@ -49,7 +50,7 @@ function flattenCreases({ posed, nVertices, data: { arrays } }, { stretched }) {
   }
   for (let v = 0; v < nVertices; v++) {
     let grown = 0;
-    for (let k = 3 * v; k < 3 * v + 3; k++) grown += skyShares[k] * Math.log(areas[skyCorners[k]] / creaseAreas[skyCorners[k]]);
+    for (let k = 3 * v; k < 3 * v + 3; k++) grown += skyShares[k] * Math.log(Math.max(areas[skyCorners[k]], LEAST_AREA) / creaseAreas[skyCorners[k]]);
     stretched[v] = between(grown, UNSTRETCHED, STRETCHED);
   }
 }
