@@ -18,7 +18,7 @@ from oasis_warp.adaptation.adapt import Adaptation, adapt, add_detail
 from oasis_warp.adaptation.photo_view import match_photo
 from oasis_warp.adaptation.rim_shade import limit_shade, match_rim
 from oasis_warp.adaptation.smooth_shade import spread_shade
-from oasis_warp.adaptation.unseen_skin import OwnSkin, PaintedSkin, paint_unseen
+from oasis_warp.adaptation.unseen_skin import SPACING, OwnSkin, PaintedSkin, paint_unseen
 from oasis_warp.avatar.densify import coarsen
 from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.avatar.prior import Prior
@@ -32,7 +32,7 @@ from oasis_warp.avatar.quality import (
     over_photo,
     photo_warnings,
 )
-from oasis_warp.avatar.wrist import close_wrist, end_shade
+from oasis_warp.avatar.wrist import ARM_STEP, close_wrist, end_shade
 from oasis_warp.core import surface
 from oasis_warp.core.config import PAPER_ADAPTATION, AdaptConfig, ReconstructConfig, check_config
 from oasis_warp.core.errors import InputError
@@ -314,7 +314,8 @@ def _finish(
         if len(close) == 1:
             with stage("detail"):
                 gaussians = match_photo(hand, gaussians, close[0], lights[0])
-    return adaptation._replace(gaussians=close_wrist(hand, gaussians, rest), lights=lights), painted
+    spacing = SPACING if painted else ARM_STEP
+    return adaptation._replace(gaussians=close_wrist(hand, gaussians, rest, spacing), lights=lights), painted
 
 
 def _guess(

@@ -112,38 +112,36 @@ def test_the_arms_detail_varies_along_it(hand, hands):
     assert float((logs - means[sector]).var() / logs.var()) > 0.6
 
 
-def test_the_hand_beyond_the_fade_keeps_its_bits_and_the_cap_goes_with_the_wrist(hand, hands):
+def test_the_hand_beyond_the_fade_keeps_its_bits_and_the_arm_goes_with_the_wrist(hand, hands):
     rest, before, after = hands
-    cap = torch.zeros(len(after.opacities), dtype=torch.bool)
-    cap[: len(after.vertex_index)] = after.offsets.norm(dim=1) > 2e-3
+    arm = arm_of(hand, rest, after)
+    own = torch.ones(len(after.opacities), dtype=torch.bool).index_fill(0, arm, False)
     changed = RIM_FADE + SHADE_FADE + 0.004  # a face wide
     beyond = [torch.cdist(centers(hand, rest, g), rest[hand.rim]).amin(1) > changed for g in hands[1:]]
     for name in ("quats", "scales", "opacities", "colors"):
-        assert torch.equal(getattr(before, name)[beyond[0]], getattr(after, name)[beyond[1] & ~cap])
+        assert torch.equal(getattr(before, name)[beyond[0]], getattr(after, name)[beyond[1] & own])
     fist = HandPose(named_pose(hand, "fist"), torch.eye(3), torch.zeros(3))
     posed = skin(hand, rest_hand(hand, torch.zeros(hand.shape_basis.shape[-1])), fist).vertices
     still, moved = (pose_gaussians(after, hand.faces, rest, to).means for to in (rest, posed))
-    shift, arm = (moved - still).norm(dim=1), arm_of(hand, rest, after)
-    assert shift[arm].max() < 1e-3  # its end swayed by 14 mm, when the rim moved with the thumb
-    shift[arm] = 0
-    assert shift[cap].max() < 1e-4
+    assert (moved - still)[arm].norm(dim=1).max() < 1e-3  # its end swayed by 14 mm, when the rim moved with the thumb
 
 
-def test_the_arm_fades_from_the_rim_on_and_hides_the_cap_along_it(hand, hands):
+def test_the_arm_fades_from_the_rim_on(hand, hands):
     """A hand that ended at once looked sawn off, in all of 52 sheets."""
     rest, _, after = hands
     axis, middle, arm = rim_axis(rest, hand.rim), rest[hand.rim].mean(0), arm_of(hand, rest, after)
+    arm = arm[after.scales[arm].std(dim=1) > 1e-6]  # without the balls inside
     height = (centers(hand, rest, after)[arm] - middle) @ axis
     end = 0.9 * ARM_LENGTH
     assert 0 < height.min() < 0.004 and end < height.max() < ARM_LENGTH
-    assert after.opacities[arm][height < 0.005].min() > 0.6 and after.opacities[arm][height > end].max() < 0.03
+    assert after.opacities[arm][height < 0.005].min() > 0.6 and after.opacities[arm][height > end].max() < 0.06
     camera = orbit_camera(torch.cat([rest, rest + ARM_LENGTH * axis]), 0.0, size=128)
     alpha = render(pose_gaussians(after, hand.faces, rest, rest), camera).alpha
     seen = []
     for share in (0.3, 0.7, 0.95):
         x, y = project(camera, (middle + share * ARM_LENGTH * axis)[None])[0][0].long()
         seen.append(float(alpha[y, x]))
-    assert seen[0] > 0.95 and 0.5 < seen[1] < 0.95 and seen[2] < 0.3
+    assert seen[0] > 0.95 and 0.5 < seen[1] < 0.98 and seen[2] < 0.3
 
 
 def test_light_falls_on_the_arm_as_on_the_skin_before_it(hand, hands):
@@ -162,15 +160,6 @@ def test_light_falls_on_the_arm_as_on_the_skin_before_it(hand, hands):
     assert (factor[arm] / factor[skin][nearest]).log().abs().median() < 0.02
 
 
-def test_the_cap_goes_on_from_the_skin_without_an_edge(hand, hands):
-    rest, _, after = hands
-    at = rest[after.vertex_index] + after.offsets
-    normals = rotation.to_matrix(after.quats[: len(at)])[:, :, 2]
-    own = torch.isin(after.vertex_index, hand.rim)
-    pairs = torch.cdist(at[own], at[own]) < 0.001
-    assert (normals[own] @ normals[own].T)[pairs].min() > math.cos(math.radians(50))
-
-
 def test_a_small_photos_hand_without_gaussians_on_faces_is_closed_too(hand, hands):
     rest, before, after = hands
     n = len(before.vertex_index)
@@ -186,30 +175,31 @@ def test_the_rim_ends_without_teeth(hand, hands):
     """One Gaussian on each of its vertices, 2.5 mm apart, drew a saw."""
     rest, _, after = hands
     at = rest[after.vertex_index] + after.offsets
-    on_rim = torch.isin(after.vertex_index, hand.rim) & (after.offsets.norm(dim=1) < 2e-3)
+    on_rim = torch.isin(after.vertex_index, hand.rim)
+    on_rim[arm_of(hand, rest, after)] = False
     second = torch.cdist(at[on_rim], at[on_rim]).topk(3, largest=False).values[:, 2]  # after itself and one side
     assert (second < 1.8 * after.scales[: len(on_rim), 0][on_rim]).all()
 
 
-def test_two_colours_of_the_arm_meet_gradually_on_the_cap(hand, hands):
+def test_two_colours_of_the_arm_meet_gradually_in_its_middle(hand, hands):
     """With one width of averaging its middle was cut in two: far from all skin, the nearest alone counted."""
     rest, before, _ = hands
     side = (rest[:, 1] > rest[hand.rim, 1].mean()).float()[:, None]
     two = before._replace(colors=torch.where(vertex_to_gaussians(side, hand.faces, before) > 0.5, SKIN, PALM))
     after = close_wrist(hand, two, rest)
-    cap = torch.nonzero(after.offsets.norm(dim=1) > 2e-3)[:, 0]
-    at = (rest[after.vertex_index] + after.offsets)[cap]
-    near = torch.cdist(at, at) < 0.0035
-    steps = (after.colors[cap][:, None] - after.colors[cap][None]).abs().amax(-1)[near]
+    arm = arm_of(hand, rest, after)
+    arm = arm[after.scales[arm].std(dim=1) < 1e-6]  # the balls inside
+    at = centers(hand, rest, after)[arm]
+    near = torch.cdist(at, at) < 0.0045
+    steps = (after.colors[arm][:, None] - after.colors[arm][None]).abs().amax(-1)[near]
     assert steps.max() < 0.25 * (SKIN - PALM).abs().max()
 
 
-def test_shade_of_the_arm_ends_before_the_cap(hand, hands):
+def test_the_arm_has_no_shade(hand, hands):
     rest, before, _ = hands
     shaded = before._replace(shade=torch.full_like(before.colors, 0.4))
     after = close_wrist(hand, shaded, rest)
-    cap = torch.nonzero(after.offsets.norm(dim=1) > 2e-3)[:, 0]
-    assert after.shade is not None and after.shade[cap].min() > 0.999 and after.shade.min() == pytest.approx(0.4)
+    assert after.shade is not None and after.shade[arm_of(hand, rest, after)].min() > 0.999 and after.shade.min() == pytest.approx(0.4)
 
 
 def test_shade_ends_three_centimetres_before_the_wrist_does(hand, hands):

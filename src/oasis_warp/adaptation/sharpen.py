@@ -22,7 +22,7 @@ from oasis_warp.adaptation.reprojection import (
     with_neighbours,
 )
 from oasis_warp.avatar.anchors import RIM_FADE, vertex_to_gaussians
-from oasis_warp.avatar.densify import densify, parts_for_spacing
+from oasis_warp.avatar.densify import FITTED, densify, parts_for_spacing
 from oasis_warp.avatar.observation import faded_in
 from oasis_warp.avatar.pose import (
     Lighting,
@@ -117,7 +117,7 @@ def sharpen(
     around, parts = _parts(rest, faces, sources, old)
     if not bool(around.any()):
         return SharpenResult(gaussians, 0, ())
-    dense, changed, n_new = densify(gaussians, rest, faces, parts, thickness=THICKNESS)
+    dense, changed, n_new = densify(gaussians, rest, faces, parts, FITTED._replace(thickness=THICKNESS))
     shown = lit_as_photo(dense, faces, light, on)
     new = [pose_gaussians(shown, faces, rest, source.posed) for source in sources]
     start = overlay_pictures(shown.colors[changed], sources, [there.means[changed] for there in new])

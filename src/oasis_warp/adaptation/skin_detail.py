@@ -56,15 +56,7 @@ class SkinDetail(NamedTuple):
     """Share of the fold around a nail."""
 
 
-class Places(NamedTuple):
-    """Places on the surface: vertices, then points of faces; fields as in `CanonicalGaussians`."""
-
-    vertex_index: Int[Tensor, "P"]
-    face_index: Int[Tensor, "Q"]
-    barycentrics: Float[Tensor, "Q 3"]
-
-
-def sample_detail(hand: HandModel, gaussians: CanonicalGaussians | Places, seed: int) -> SkinDetail:
+def sample_detail(hand: HandModel, gaussians: CanonicalGaussians, seed: int) -> SkinDetail:
     """Read the maps at every Gaussian: skin of three hands, mixed place by place and a little warped as `seed` says.
 
     The lines are one person's: where those of two were mixed, they ended abruptly. Persons take turns with the seed.

@@ -9,12 +9,12 @@ from torch.nn.functional import normalize
 
 from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.adaptation.reliability import VertexObservations
-from oasis_warp.adaptation.sharpen import FADE_REACH
-from oasis_warp.adaptation.skin_detail import Places, SkinDetail, flush_shade, relief_shade, sample_detail
+from oasis_warp.adaptation.skin_detail import SkinDetail, flush_shade, relief_shade, sample_detail
+from oasis_warp.adaptation.skin_grain import skin_grain
 from oasis_warp.adaptation.skin_tone import MIN_COLOR, SkinTone, infer_tone
-from oasis_warp.avatar.anchors import RIM_FADE, vertex_colors, vertex_to_gaussians
+from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.appearance import skin_regions
-from oasis_warp.avatar.densify import densify, part_centers
+from oasis_warp.avatar.densify import SKIN, densify, parts_for_spacing
 from oasis_warp.avatar.observation import observe
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import TIP_JOINTS, HandModel
@@ -29,10 +29,8 @@ JOIN_DETAIL, JOIN_REACH = 0.004, 0.04
 the person's mean colours [m]."""
 MAX_DIFFERENT = 0.3
 """Difference of the logarithms from the person's mean colours that is carried on: more is dirt, a ring or a shadow."""
-MORE = 2.0
-"""Gaussians after painting over those before, at most."""
-PARTS = 3
-"""An edge, of faces that are cut for the painting."""
+SPACING = 0.55e-3
+"""Side of the squares that are as large as the parts of faces are at most [m]."""
 SHOWS_FORM = 0.3
 """Cosine between normal and view from which a photo shows the forms of skin that it shows on a slant."""
 ON_PALM, ON_BACK = 1.6, 1.25
@@ -53,8 +51,6 @@ FINE_PASSES, SURELY_SEEN, FEWEST = 3, 0.97, 200
 """Smoothings over the mesh that leave a vertex's surroundings, 3 mm; confidence there from which it counts; fewest."""
 CLARITIES = 0.5, 1.2
 """Least and most gain of detail."""
-GRAIN = 0.04
-"""Standard deviation of what each Gaussian on a face has of its own: pores and the mesh of fine wrinkles."""
 LUNULA, FREE_EDGE, NAIL_RIM = (0.02, 0.08, 0.08), (0.06, 0.22, 0.22), (-0.12, -0.16, -0.16)
 """What is added to the logarithms of the bed's colour on a nail's lunula and its free edge, and to skin in the fold
 around it."""
@@ -100,9 +96,10 @@ def paint_unseen(
 
     A painted place is exp(t + x + d). The mean colour t is that of the region in the person's tone (`infer_tone`). The
     membrane x continues the difference of the seen skin from it (`inpaint`). The detail d comes from real hands
-    (`sample_detail`), with the skin's relief (`relief_shade`) and blotches of blood (`flush_shade`). Where the seen
-    skin ends, t + x is its own smooth colour, so that gradients continue and no seam shows. Seen Gaussians stay bit for
-    bit; the largest unseen faces are cut into finer ones.
+    (`sample_detail`), with the skin's relief (`relief_shade`), blotches of blood (`flush_shade`) and grain
+    (`skin_grain`). Where the seen skin ends, t + x is its own smooth colour, so that gradients continue and no seam
+    shows. Faces with one Gaussian are cut into finer ones everywhere: in a fist that fills the picture, skin that is as
+    coarse as that of an open hand looks like wax. Seen skin gets grain, which its shade removes in the photo.
 
     Args:
         hand: Model of the surface.
@@ -127,17 +124,15 @@ def paint_unseen(
     smooth = inpaint(rest, faces, difference, sure, detail=JOIN_DETAIL, fade=JOIN_REACH)
     bed = _nail_color(tone, seen, confidence * nail, nail.sum())
 
-    fine = densify(
-        gaussians, rest, faces, _parts(hand, gaussians, rest, torch.minimum(invented, 1 - shown), seed)
-    ).gaussians
+    fine = densify(gaussians, rest, faces, _parts(gaussians, rest, faces), SKIN).gaussians
     unknown = (1 - first.visibility * first.facing / SHOWS_FORM).clamp(0, 1)
     skin = OwnSkin(tone, *_clarities(hand, observations))
     form = _skin_form(hand, rest, seed) * unknown[:, None]
-    painted = _paint_on(
+    painted, grain = _paint_on(
         hand, fine, rest, tone.log_skin + form + smooth, bed + smooth + _nail_form(hand, rest), skin, seed
     )
     shares = vertex_to_gaussians(torch.stack([invented, shown], 1), faces, fine).clamp(0, 1)
-    return PaintedSkin(_mix(fine, painted, *shares.split(1, 1)), invented, skin)
+    return PaintedSkin(_mix(fine, painted, grain, *shares.split(1, 1)), invented, skin)
 
 
 @torch.no_grad()
@@ -153,10 +148,10 @@ def paint_hand(
         skin: Of its person.
         seed: Seed of the detail.
     """
-    faces, everywhere = hand.faces.to(rest.device), torch.ones_like(rest[:, 0])
-    fine = densify(guess, rest, faces, _parts(hand, guess, rest, everywhere, seed)).gaussians
+    faces = hand.faces.to(rest.device)
+    fine = densify(guess, rest, faces, _parts(guess, rest, faces), SKIN).gaussians
     nails = skin.tone.log_nail + _nail_form(hand, rest)
-    painted = _paint_on(hand, fine, rest, skin.tone.log_skin + _skin_form(hand, rest, seed), nails, skin, seed)
+    painted, _ = _paint_on(hand, fine, rest, skin.tone.log_skin + _skin_form(hand, rest, seed), nails, skin, seed)
     return fine._replace(colors=painted.exp().clamp(MIN_COLOR, 1), shade=None)
 
 
@@ -169,33 +164,32 @@ def _skin_form(hand: HandModel, rest: Float[Tensor, "V 3"], seed: int) -> Float[
 def _paint_on(
     hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tensor, "V 3"], skin: Float[Tensor, "V 3"],
     nails: Float[Tensor, "V 3"], own: OwnSkin, seed: int,
-) -> Float[Tensor, "N 3"]:  # fmt: skip
-    """Logarithms of the Gaussians' colours, from those of smooth skin and nails at the vertices."""
+) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 1"]]:  # fmt: skip
+    """Logarithms of the Gaussians' colours, from those of smooth skin and nails at the vertices, and their grain."""
     palm = skin_regions(hand).palm.to(rest)[:, None]
     read = vertex_to_gaussians(torch.cat([skin, nails, palm], 1), hand.faces.to(rest.device), gaussians)
     sample = sample_detail(hand, gaussians, seed)
-    detail = _skin_detail(sample, read[:, 6:]) + _grain(gaussians, seed)
     gain = own.of_back + (own.of_palm - own.of_back) * read[:, 6:]
-    return _paint(sample, read[:, :3] + gain * detail, read[:, 3:6])
+    grain = gain * skin_grain(hand, gaussians, seed)[:, None]
+    return _paint(sample, read[:, :3] + gain * _skin_detail(sample, read[:, 6:]) + grain, read[:, 3:6]), grain
 
 
 def _mix(
-    gaussians: CanonicalGaussians, painted: Float[Tensor, "N 3"], invented: Float[Tensor, "N 1"], shown: Tensor
+    gaussians: CanonicalGaussians, painted: Float[Tensor, "N 3"], grain: Tensor, invented: Tensor, shown: Tensor
 ) -> CanonicalGaussians:
-    """The Gaussians with the painted colours where they are invented.
+    """The Gaussians with the painted colours where they are invented, and with `grain` where they are not.
 
-    What the first photo shows there, on a slant or unreliably, becomes shade: it stays in the photo's own view and goes
-    when the skin turns. Without shade it stays as it is.
+    What the first photo shows becomes shade: it stays in the photo's own view and goes when the skin turns. Without
+    shade it stays as it is.
     """
     if gaussians.shade is None:
-        invented = invented * (1 - shown)
+        invented, grain = invented * (1 - shown), torch.zeros_like(grain)
     logs = gaussians.colors.clamp_min(MIN_COLOR).log()
-    colors = torch.where(invented > 0, torch.lerp(logs, painted, invented).exp().clamp(MIN_COLOR, 1), gaussians.colors)
+    colors = torch.lerp(logs + grain, painted, invented).exp().clamp(MIN_COLOR, 1)
     if gaussians.shade is None:
-        return gaussians._replace(colors=colors)
-    beyond = shown * (logs - colors.clamp_min(MIN_COLOR).log())
-    shade = torch.where(invented > 0, gaussians.shade * beyond.exp(), gaussians.shade)
-    return gaussians._replace(colors=colors, shade=shade)
+        return gaussians._replace(colors=torch.where(invented > 0, colors, gaussians.colors))
+    beyond = torch.maximum(shown, 1 - invented) * (logs - colors.log())
+    return gaussians._replace(colors=colors, shade=gaussians.shade * beyond.exp())
 
 
 def _unseen_share(hand: HandModel, confidence: Float[Tensor, "V"]) -> Float[Tensor, "V"]:
@@ -228,35 +222,10 @@ def _nail_color(tone: SkinTone, seen: Tensor, weight: Float[Tensor, "V"], total:
     return torch.lerp(tone.log_nail, own, known / (known + KNOWN_NAIL))
 
 
-def _parts(
-    hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tensor, "V 3"], invented: Float[Tensor, "V"], seed: int
-) -> Int[Tensor, "F"]:
-    """Parts an edge: `PARTS` for the unseen faces of one Gaussian that have most detail, as many as `MORE` allows.
-
-    Where the wrist ends, parts would not fade, so those faces stay as they are.
-    """
-    faces = hand.faces.to(rest.device)
-    fading = torch.cdist(rest, rest[hand.rim.to(rest.device)]).amin(1) < FADE_REACH * RIM_FADE
+def _parts(gaussians: CanonicalGaussians, rest: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Int[Tensor, "F"]:
+    """Parts an edge of the faces that have one Gaussian; those that show a photo's detail have more."""
     n_own = torch.bincount(gaussians.face_index, minlength=len(faces))
-    may = torch.nonzero((invented[faces].amin(1) > 0.5) & (n_own == 1) & ~fading[faces].any(1))[:, 0]
-    if not len(may):  # all is seen, or none of a small photo's Gaussians are on faces
-        return torch.ones_like(n_own)
-    count = min(len(may), int((MORE - 1) * len(gaussians.opacities) / (PARTS**2 - 1)))
-    centers = part_centers(PARTS).to(rest)
-    places = Places(may[:0], may.repeat_interleave(len(centers)), centers.repeat(len(may), 1))
-    sample = sample_detail(hand, places, seed)
-    skin = _skin_detail(sample, 0.0)
-    detail = _paint(sample, skin, torch.zeros_like(skin)).mean(1).view(len(may), len(centers))
-    _, areas = surface.face_normals(rest, faces)
-    chosen = (detail.var(1) * areas[may]).argsort(descending=True, stable=True)[:count]
-    return torch.ones_like(n_own).index_fill(0, may[chosen], PARTS)
-
-
-def _grain(gaussians: CanonicalGaussians, seed: int) -> Float[Tensor, "N 1"]:
-    """White noise; none on vertices, whose Gaussians lie below those of faces. On the CPU, for equal bits."""
-    noise = torch.randn(len(gaussians.face_index), generator=torch.Generator().manual_seed(seed + 1))
-    none = gaussians.colors.new_zeros(len(gaussians.vertex_index))
-    return GRAIN * torch.cat([none, noise.to(none)])[:, None]
+    return torch.where(n_own == 1, parts_for_spacing(rest, faces, SPACING), 1)
 
 
 def _skin_detail(detail: SkinDetail, palm: Float[Tensor, "N 1"] | float) -> Float[Tensor, "N 3"]:

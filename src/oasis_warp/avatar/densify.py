@@ -15,18 +15,35 @@ from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.processes import kernel_threads
 from oasis_warp.core.types import CanonicalGaussians, PosedHand
 
-PART_SPREAD = 1.9
-"""Standard deviations of a part's Gaussian over those of the part as a uniform plate."""
-PART_OPACITY = 0.28
-"""Opacity of a part's Gaussian. The more opaque Gaussians overlap, the more the nearer ones hide those beside them, and
-the picture moves to the side that is nearer in the view at hand."""
+
+class PartLooks(NamedTuple):
+    """How large and how opaque the Gaussians of parts are."""
+
+    spread: float
+    """Standard deviations of a part's Gaussian over those of the part as a uniform plate."""
+    opacity: float
+    """The more opaque Gaussians overlap, the more the nearer ones hide those beside them."""
+    ground: float
+    """Standard deviations of the discs under parts over those of a vertex Gaussian. Wide ones stand out of strong
+    bends, as a blur."""
+    thickness: float = 0.0
+    """Least standard deviation across the surface [m]."""
+
+
+FITTED = PartLooks(1.9, 0.28, 1.4)
+"""For colours that are fitted to a photo. With more opaque parts the picture moves to the side that is nearer in the
+view at hand. The hand's other side shimmers through half transparent ones when the ground has a spread of 1, at the
+wrist the background; with 1.8 the hand from afar is less like its photo."""
+SKIN = PartLooks(1.5, 0.8, 1.05)
+"""For skin that is painted, as sharp as the parts allow. With a ground of .85 stretched skin has gaps, with 1.4
+knuckles have a blur of 1 mm."""
 SOLID = 0.25
 """Opacity of an old Gaussian below which the surface itself is taken for fading, as at the wrist."""
 GROUND_DEPTH = 0.001
 """Depth at which the vertex Gaussians of cut faces go on, as discs that are the ground under the parts' [m]."""
-GROUND_SPREAD = 1.4
-"""Standard deviations of those discs over those of a vertex Gaussian. Parts are half transparent: with 1 the hand's
-other side shimmers through, at the wrist the background; with 1.8 the hand from afar is less like its photo."""
+GROUND_THICKNESS = 0.00025
+"""Their largest standard deviation across the surface [m]. Half as thick as wide, they had up to .8 mm and stood out of
+the skin: outlines of fists had a blur of 1 mm."""
 NEIGHBOURS = 12
 """Old Gaussians that a new one takes its looks from."""
 
@@ -43,7 +60,7 @@ class Densified(NamedTuple):
 
 
 def parts_for_spacing(
-    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], spacing: Float[Tensor, "F"]
+    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], spacing: float | Float[Tensor, "F"]
 ) -> Int[Tensor, "F"]:
     """Parts an edge into which each face is cut, so that a part is at most `spacing` [m] squared; 1 for no cut."""
     _, areas = surface.face_normals(vertices, faces)
@@ -55,8 +72,7 @@ def densify(
     vertices: Float[Tensor, "V 3"],
     faces: Int[Tensor, "F 3"],
     parts: Int[Tensor, "F"],
-    *,
-    thickness: float = 0.0,
+    looks: PartLooks = FITTED,
 ) -> Densified:
     """Replace the Gaussians on some faces by finer ones that look the same.
 
@@ -70,7 +86,7 @@ def densify(
         vertices: Vertices of the surface at rest [m].
         faces: Faces of the surface.
         parts: An edge, for each face; 1 leaves the face as it is.
-        thickness: Least standard deviation of the parts' Gaussians across the surface [m].
+        looks: Of the parts' Gaussians.
     """
     opacity = _face_opacities(gaussians, faces)
     cut = (parts > 1) & (opacity >= MIN_OPACITY)
@@ -81,33 +97,35 @@ def densify(
     disc_opacities = OPACITY * (_vertex_opacities(gaussians, faces, opacity, len(vertices))[index] / SOLID).clamp(max=1)
     on_top = ~cut[gaussians.face_index]
 
-    face_index, barycentrics = _cut(parts, cut, vertices.dtype)
-    quats, scales = face_shapes(vertices, faces)
-    long, short, across = (scales * (PART_SPREAD / FACE_SPREAD / parts[:, None])).unbind(1)
-    scales = torch.stack([long, short, across.clamp_min(thickness)], 1)
+    face_index, barycentrics, quats, scales = cut_faces(vertices, faces, torch.where(cut, parts, 0), looks)
     centers = (vertices[faces[face_index]] * barycentrics[..., None]).sum(1)
 
     def joined(old: Tensor, ground: Tensor, fine: Tensor) -> Tensor:
         points = torch.where(sunk.view(-1, *[1] * (old.ndim - 1)), ground, old[:n_points])
         return torch.cat([points, old[n_points:][on_top], fine])
 
-    looks = gaussians.colors if gaussians.shade is None else torch.cat([gaussians.colors, gaussians.shade], 1)
-    looks = joined(looks, looks[:n_points], read_at(gaussians, looks, vertices, faces, centers))
+    colors = gaussians.colors if gaussians.shade is None else torch.cat([gaussians.colors, gaussians.shade], 1)
+    colors = joined(colors, colors[:n_points], read_at(gaussians, colors, vertices, faces, centers))
 
     dense = CanonicalGaussians(
         index,
         torch.where(sunk[:, None], -depth, gaussians.offsets),
         torch.cat([gaussians.face_index[on_top], face_index]),
         torch.cat([gaussians.barycentrics[on_top], barycentrics]),
-        joined(gaussians.quats, disc_quats[index], quats[face_index]),
-        joined(gaussians.scales, GROUND_SPREAD * disc_scales[index], scales[face_index]),
-        joined(gaussians.opacities, disc_opacities, PART_OPACITY * (opacity[face_index] / SOLID).clamp(max=1)),
-        looks[:, :3],
-        None if gaussians.shade is None else looks[:, 3:],
+        joined(gaussians.quats, disc_quats[index], quats),
+        joined(gaussians.scales, ground_discs(looks.ground * disc_scales[index]), scales),
+        joined(gaussians.opacities, disc_opacities, looks.opacity * (opacity[face_index] / SOLID).clamp(max=1)),
+        colors[:, :3],
+        None if gaussians.shade is None else colors[:, 3:],
     )
     n_new = len(face_index)
     changed = torch.cat([sunk, torch.zeros_like(on_top[on_top]), torch.ones_like(face_index, dtype=torch.bool)])
     return Densified(dense, changed, n_new)
+
+
+def ground_discs(scales: Float[Tensor, "*B V 3"]) -> Float[Tensor, "*B V 3"]:
+    """Standard deviations of discs below the surface that do not stand out of it [m]."""
+    return torch.cat([scales[..., :2], scales[..., 2:].clamp(max=GROUND_THICKNESS)], -1)
 
 
 def _face_opacities(gaussians: CanonicalGaussians, faces: Int[Tensor, "F 3"]) -> Tensor:
@@ -140,16 +158,22 @@ def _inside(cut: Bool[Tensor, "F"], faces: Tensor, n_vertices: int) -> Bool[Tens
     return ~whole
 
 
-def _cut(parts: Tensor, cut: Tensor, dtype: torch.dtype) -> tuple[Int[Tensor, "M"], Float[Tensor, "M 3"]]:
-    """Face and barycentrics of the centre of every part."""
-    index, place = [torch.zeros(0, dtype=torch.int64)], [torch.zeros(0, 3, dtype=dtype)]
-    wanted = torch.where(cut, parts, 0).cpu()
+def cut_faces(
+    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], parts: Int[Tensor, "F"], looks: PartLooks
+) -> tuple[Int[Tensor, "M"], Float[Tensor, "M 3"], Float[Tensor, "M 4"], Float[Tensor, "M 3"]]:
+    """Faces, barycentrics, quaternions and scales [m] of Gaussians at the centres of `parts` an edge, 0 for none."""
+    index, place = [torch.zeros(0, dtype=torch.int64)], [torch.zeros(0, 3, dtype=vertices.dtype)]
+    wanted = parts.cpu()
     for n in wanted.unique().tolist():
         if n:
             on = torch.nonzero(wanted == n)[:, 0]
             index.append(on.repeat_interleave(n * n))
-            place.append(part_centers(n).to(dtype).repeat(len(on), 1))
-    return torch.cat(index).to(parts.device), torch.cat(place).to(parts.device)
+            place.append(part_centers(n).to(vertices.dtype).repeat(len(on), 1))
+    rows = torch.cat(index).to(parts.device)
+    quats, scales = face_shapes(vertices, faces)
+    long, short, across = (scales[rows] * (looks.spread / FACE_SPREAD / parts[rows, None])).unbind(1)
+    scales = torch.stack([long, short, across.clamp_min(looks.thickness)], 1)
+    return rows, torch.cat(place).to(parts.device), quats[rows], scales
 
 
 @functools.cache

@@ -30,8 +30,9 @@ STRETCHED = (0.10, 0.08, 0.06)
 """What bending adds to the logarithms of colours of folding skin: stretched over the joint it is paler and warmer."""
 LEAST = 0.02
 """Share of folding skin from which a Gaussian has folds."""
-MOST = 0.5
-"""Largest logarithm by which folds are darker: more is a ring, ink or a shadow."""
+MOST, OPEN = 0.5, 0.06
+"""Largest logarithm by which folds are darker: more is a ring, ink or a shadow. And that which open ones tend to: the
+grain of skin stays."""
 HOLLOW_PASSES, SHALLOW = 60, 0.1
 """Smoothings that leave the back without tendons and hollows, about 15 mm, and the logarithm that hollows tend to in a
 fist: wholly without them a back is a mitten."""
@@ -168,32 +169,33 @@ def find_folds(
     n, like, faces, joint, back = len(hand.template), gaussians.colors, hand.faces, _joint_skin(hand), _back_skin(hand)
     logs = vertex_colors(gaussians, n).clamp_min(MIN_COLOR).log()
     painted = like.new_zeros(n, 1) if invented is None else invented[:, None].to(like)
-    fields = like.new_zeros(n, 4)
-    fields = fields.index_copy(0, joint.vertex, _folds_of_fingers(joint, logs[joint.vertex]))
-    fields = fields.index_add(0, back.vertex, _relief_of_back(back, logs[back.vertex]))
-    read = vertex_to_gaussians(torch.cat([fields, painted], 1), faces, gaussians)
-    index = torch.nonzero(read[:, 3] > LEAST)[:, 0]
+    on_fingers = torch.cat([logs, like.new_zeros(n, 1)], 1)  # read by Gaussians beside folding skin
+    on_fingers = on_fingers.index_copy(0, joint.vertex, _skin_around_folds(joint, logs[joint.vertex]))
+    on_back = like.new_zeros(n, 4).index_copy(0, back.vertex, _relief_of_back(back, logs[back.vertex]))
+    read = vertex_to_gaussians(torch.cat([on_fingers, on_back, painted], 1), faces, gaussians)
+    around, fold, of_back, share, painted = read.split([3, 1, 3, 1, 1], 1)
+    beyond = (gaussians.colors.clamp_min(MIN_COLOR).log() - around).clamp(-MOST, 0)
+    change = fold * (like.new_tensor(STRETCHED) - beyond_shallow(beyond, OPEN)) + of_back
+    index = torch.nonzero((fold + share)[:, 0] > LEAST)[:, 0]
     first = torch.cat([gaussians.vertex_index, faces[gaussians.face_index, 0]])[index]
     over = joint.joint[first]
     return Folds(
         index=index,
         joints=torch.where(over[:, None] < 0, back.joints[first], over[:, None]),
         between=back.between[first, None],
-        change=read[index, :3],
-        painted=read[index, 4:],
+        change=change[index],
+        painted=painted[index],
         straight=-hand.rest_bend[1:].to(angles),
         photo=angles[:, 0],
     )
 
 
-def _folds_of_fingers(skin: _JointSkin, logs: Float[Tensor, "S 3"]) -> Float[Tensor, "S 4"]:
-    """By how much folds are darker than the skin around, and the share of skin that folds."""
+def _skin_around_folds(skin: _JointSkin, logs: Float[Tensor, "S 3"]) -> Float[Tensor, "S 4"]:
+    """Logarithms of the colours around a joint, and the share of skin that folds."""
     fold, bare = skin.fold[:, None].to(logs), skin.bare[:, None].to(logs)
     known = (1 - fold) * bare
     around = surface.smooth_over_mesh(torch.cat([logs * known, known], 1), skin.edges, PASSES)
-    around = around[:, :3] / around[:, 3:].clamp_min(1e-6)
-    change = (around - logs).clamp(0, MOST) + logs.new_tensor(STRETCHED)
-    return torch.cat([change * fold * bare, fold * bare], 1)
+    return torch.cat([around[:, :3] / around[:, 3:].clamp_min(1e-6), fold * bare], 1)
 
 
 def _relief_of_back(skin: _BackSkin, logs: Float[Tensor, "B 3"]) -> Float[Tensor, "B 4"]:

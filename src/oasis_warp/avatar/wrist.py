@@ -1,4 +1,4 @@
-"""The end of the hand at the wrist: opaque skin up to the rim, a rounded cap over the opening, an arm that fades."""
+"""The end of the hand at the wrist: opaque skin up to the rim, and an arm that fades."""
 
 import math
 
@@ -18,6 +18,7 @@ from oasis_warp.avatar.anchors import (
     surface_frames,
     vertex_to_gaussians,
 )
+from oasis_warp.avatar.densify import GROUND_DEPTH, SKIN, cut_faces, ground_discs, parts_for_spacing
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, HandLight
@@ -29,19 +30,15 @@ SHADE_FADE = 0.022
 looks like a burn where the arm is missing."""
 SMOOTHING = 0.004
 """Standard deviation of the average of colours from before the fade [m]: photos show sleeves and shadows there."""
-CAP_HEIGHT = 0.008
-"""Height of the cap over the rim [m]: as much as pictures of a hand leave around it."""
-CAP_RINGS = 20
-"""Steps of the cap's rings from the rim to its middle: 1.5 mm, closer than the skin's vertices."""
-FIRST_RING = 4
-"""The first of these rings, 1.5 mm inside the rim: those before it stood out beside the arm."""
 MIRRORED = 0.05
 """The stretch of skin before the rim whose detail the end of the wrist repeats in the mirror [m]."""
 REPEATED = MIRRORED - RIM_FADE
 """The stretch after which the mirror turns again [m]: past it the skin's last row would go on as streaks."""
 AVERAGED = 100
-"""Number of nearest Gaussians of that skin, 6 mm around; detail is the difference of one from their mean. With 32 the
+"""Number of nearest places of that skin, 6 mm around; detail is the difference of one from their mean. With 32 the
 blotches of a back ended at the rim."""
+PLACES = 4000
+"""Most places of skin that means are taken of; with coarse skin there are so many."""
 DARKEST = 0.02
 """Colours are clamped to it before their logarithm is taken [sRGB]."""
 CONTRAST = 0.045
@@ -57,33 +54,37 @@ BEFORE_RIM, ASIDE = 0.008, 0.004
 STRAIGHT = 0.008
 """Length over which the arm turns from the direction of the skin before the rim into its own [m]: with a sudden turn
 outlines had a step. It and `FIRST_RING` were set by eye on two hands."""
-ARM_STEP, COARSER = 0.001, 1.6
-"""Distance of the arm's Gaussians at the rim [m], half of that of the skin's vertices, and how much larger it is at the
-end: with 2 mm the skin's detail ended at the rim, with 3 times as much at the end the arm was blurred."""
-FILL_STEP = 0.004
-"""Distance of the balls that fill the arm [m]."""
-ARM_LAYERS, FILL_LAYERS = 2.5, 12.0
+ARM_STEP, LAST_STEP = 0.001, 0.0016
+"""Distance of the arm's Gaussians at the rim, where skin is not finer, and at its end [m]: with 2 mm at the rim the
+skin's detail ended there, with 3 mm at the end the arm was blurred."""
+FILL_STEP, FILL_SPREAD, FILL_DEPTH = 0.004, 0.8, 0.007
+"""Distance of the balls that fill the arm [m], their standard deviation over it, and how deep the first lie [m]: nearer
+to the skin they blur the arm's outline."""
+ARM_LAYERS, FILL_LAYERS = 1.5, 12.0
 """Numbers of the arm's Gaussians and of balls one behind the other, each of them so much fainter. There are more balls,
 so the arm is opaque for 6 cm and then fades."""
 RIM_PARTS = -1 / 3, 0.0, 1 / 3
 """Places of Gaussians along the edges at a vertex of the rim, as shares of the edge: one on each vertex makes teeth."""
 RIM_SPREAD = 0.8
 """Standard deviation of the rim's Gaussians over their distance."""
-CAP_SPREAD = 1.9
-"""Standard deviations of the cap's Gaussians over those of vertex Gaussians: no face Gaussians fill their gaps."""
+WALL_SPREAD = 1.3
+"""Standard deviations of the arm's Gaussians over those of vertex Gaussians: no face Gaussians fill their gaps."""
 
 
-def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tensor, "V 3"]) -> CanonicalGaussians:
+def close_wrist(
+    hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tensor, "V 3"], spacing: float = ARM_STEP
+) -> CanonicalGaussians:
     """Close the hand at the wrist, where a prior's opacity fades out because photos show an arm there.
 
-    Gaussians in the second half of the fade are replaced by opaque ones on every vertex and face; the others become as
-    opaque as they were before the fade. The Gaussians of cap and arm are bound to rim vertices. New Gaussians continue
-    the colours of those before the fade, without shade; the shade of the others ends before.
+    Gaussians in the second half of the fade are replaced by opaque ones on parts of faces, over discs at the vertices;
+    the others become as opaque as they were before the fade. The Gaussians of the arm are bound to rim vertices. New
+    Gaussians continue the colours of those before the fade, without shade; the shade of the others ends before.
 
     Args:
         hand: Model of the surface.
         gaussians: On `rest`.
         rest: The surface at rest [m].
+        spacing: Distance of the new Gaussians at the rim [m].
     """
     faces, rim = hand.faces.to(rest.device), hand.rim.to(rest.device)
     full = batch_anchors(rest[None], faces, surface.faces_of_vertices(faces, len(rest)), rim)
@@ -93,15 +94,18 @@ def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tens
     kept, n_kept = select(kept, own > END), int((own[: len(gaussians.vertex_index)] > END).sum())
     inside = torch.ones_like(at_vertices).index_fill(0, rim, 0) > 0
     vertices, on_faces = (torch.nonzero(part)[:, 0] for part in ((at_vertices < OVERLAP) & inside, at_faces < OVERLAP))
-    rows = vertices, len(rest) + on_faces
-    *arm, arm_opacities = fading_arm(rest, rim)
-    end = rim_line(rest, rim, full.quats[0, rim]), rim_cap(rest, rim), arm
+    parts = torch.zeros_like(hand.faces[:, 0]).to(rest.device)
+    parts[on_faces] = parts_for_spacing(rest, faces[on_faces], spacing)
+    on_faces, places, face_quats, face_scales = cut_faces(rest, faces, parts, SKIN)
+    *arm, arm_opacities = fading_arm(rest, rim, spacing)
+    end = rim_line(rest, rim, full.quats[0, rim]), arm
     index, offsets, end_quats, end_scales = (torch.cat(parts) for parts in zip(*end, strict=True))
-    scales = full.scales[0]
+    discs = ground_discs(SKIN.ground * full.scales[0, vertices])
     points = torch.cat([rest[vertices], rest[index] + offsets])
+    on_parts = (rest[faces[on_faces]] * places[..., None]).sum(1)
     left = vertex_to_gaussians(shade_left(hand, rest), faces, kept)
     kept = kept._replace(colors=_calmed(kept, rest, faces, (2 * left).clamp(max=1)))
-    read = _continued(gaussians, own, rest, faces, rim, torch.cat([points, rest[faces[on_faces]].mean(1)]))
+    read = _continued(gaussians, own, rest, faces, rim, torch.cat([points, on_parts]))
     read = read.split([len(points), len(on_faces)])
 
     opaque = rest.new_full((len(points) + len(on_faces) - len(arm_opacities),), OPACITY)
@@ -115,11 +119,11 @@ def close_wrist(hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tens
         shade = shade**left
     return CanonicalGaussians(
         torch.cat([kept.vertex_index, vertices, index]),
-        torch.cat([kept.offsets, torch.zeros_like(rest[vertices]), offsets]),
+        torch.cat([kept.offsets, -GROUND_DEPTH * surface.vertex_normals(rest, faces)[vertices], offsets]),
         torch.cat([kept.face_index, on_faces]),
-        torch.cat([kept.barycentrics, rest.new_full((len(on_faces), 3), 1 / 3)]),
-        joined(kept.quats, torch.cat([full.quats[0, rows[0]], end_quats]), full.quats[0, rows[1]]),
-        joined(kept.scales, torch.cat([scales[rows[0]], end_scales]), scales[rows[1]]),
+        torch.cat([kept.barycentrics, places]),
+        joined(kept.quats, torch.cat([full.quats[0, vertices], end_quats]), face_quats),
+        joined(kept.scales, torch.cat([discs, end_scales]), face_scales),
         joined(kept.opacities, torch.cat([on_points, arm_opacities]), of_faces),
         joined(kept.colors, *read),
         None if shade is None else joined(shade, *(torch.ones_like(part) for part in read)),
@@ -143,10 +147,16 @@ def _centers(gaussians: CanonicalGaussians, rest: Tensor, faces: Tensor) -> Floa
 
 def _average(logs: Float[Tensor, "N 3"], places: Tensor, at: Float[Tensor, "M 3"]) -> tuple[Tensor, Tensor]:
     """Mean of the skin's logarithms around each point, and the share of its detail that has no more than `CONTRAST`."""
-    around = logs[_nearest(at, places, AVERAGED)]
+    some = _some(torch.arange(len(places), device=places.device))
+    around = logs[some][_nearest(at, places[some], AVERAGED)]
     average = around.mean(1)
     contrast = (around - average[:, None]).square().mean((1, 2)).sqrt()
     return average, (CONTRAST / contrast.clamp_min(CONTRAST))[:, None]
+
+
+def _some(index: Int[Tensor, "N"]) -> Int[Tensor, "M"]:
+    """About as many places as coarse skin has there."""
+    return index[:: max(1, round(len(index) / PLACES))]
 
 
 def _calmed(gaussians: CanonicalGaussians, rest: Tensor, faces: Tensor, left: Float[Tensor, "N 1"]) -> Tensor:
@@ -163,14 +173,14 @@ def _continued(
 ) -> Float[Tensor, "M 3"]:
     """Colours at `points` past where the fade begins: smooth ones from just before it, with detail of skin.
 
-    They are averages, and wider where the skin is farther away. With one width the middle of the cap would have wedges
+    They are averages, and wider where the skin is farther away. With one width the middle of the arm would have wedges
     of one colour each. Detail is the difference of the skin as far before that place, in the same direction from the
-    wrist's axis, from its own averages; towards the middle of the cap, where all directions meet, it ends.
+    wrist's axis, from its own averages; towards the middle of the arm, where all directions meet, it ends.
     """
     centers = _centers(gaussians, rest, faces)
     far = torch.cdist(centers, rest[rim]).amin(1)
     skin = (fade >= 1) & (far < MIRRORED)
-    start = skin & (far < 2 * RIM_FADE)
+    start = _some(torch.nonzero(skin & (far < 2 * RIM_FADE))[:, 0])
     near = torch.cdist(points, centers[start]).square()
     spread = SMOOTHING**2 + near.amin(1, keepdim=True)
     mean = torch.softmax(-0.5 * near / spread, 1) @ gaussians.colors[start]
@@ -238,7 +248,7 @@ def _slopes(rest: Tensor, rim: Tensor, axis: Tensor) -> Float[Tensor, "R 3"]:
 def rim_line(
     rest: Float[Tensor, "V 3"], rim: Int[Tensor, "R"], quats: Float[Tensor, "R 4"]
 ) -> tuple[Int[Tensor, "M"], Float[Tensor, "M 3"], Float[Tensor, "M 4"], Float[Tensor, "M 3"]]:
-    """Vertex Gaussians along the rim, as `rim_cap` gives them, with the orientations of its vertices."""
+    """Vertices of the rim, offsets, quaternions and scales [m] of Gaussians along it, oriented as its vertices are."""
     edge, n = rest[rim], len(RIM_PARTS)
     before, after = edge.roll(1, 0) - edge, edge.roll(-1, 0) - edge
     offsets = torch.stack([part * after if part > 0 else -part * before for part in RIM_PARTS], 1).flatten(0, 1)
@@ -247,46 +257,22 @@ def rim_line(
     return rim.repeat_interleave(n), offsets, quats.repeat_interleave(n, 0), scales.repeat_interleave(n, 0)
 
 
-def rim_cap(
-    rest: Float[Tensor, "V 3"], rim: Int[Tensor, "R"]
-) -> tuple[Int[Tensor, "M"], Float[Tensor, "M 3"], Float[Tensor, "M 4"], Float[Tensor, "M 3"]]:
-    """Vertex Gaussians that close the open end: vertices of the rim, offsets, quaternions and scales [m].
-
-    With arms a from the middle of the rim to its points, p = cos(f) a + sin(f) h: half an ellipsoid from `FIRST_RING`
-    on. Points of a ring are as far apart as the rings.
-    """
-    edge, axis = rest[rim], rim_axis(rest, rim)
-    arms = edge - edge.mean(0)
-    step = float(math.pi / 2 / CAP_RINGS)
-    length = step * math.hypot(float(arms.norm(dim=1).mean()), CAP_HEIGHT) / math.sqrt(2)  # of a step, in the mean
-    index, offsets, normals, tangents = [], [], [], []
-    for k in range(FIRST_RING, CAP_RINGS + 1):
-        share, height = math.cos(step * k), math.sin(step * k)
-        rows, arm, out, tangent = _ring(edge, axis, length / share, 0.5 * (k % 2))
-        index.append(rows)
-        offsets.append(edge.mean(0) + share * arm + height * CAP_HEIGHT * axis - edge[rows])
-        flat = out.norm(dim=1, keepdim=True) * arm.norm(dim=1, keepdim=True) * axis
-        normals.append(normalize(share * CAP_HEIGHT * out + height * flat, dim=-1))
-        tangents.append(tangent)
-    quats = surface_frames(torch.cat(normals), torch.cat(tangents))
-    return rim[torch.cat(index)], torch.cat(offsets), quats, _discs(length, quats)
-
-
 def fading_arm(
-    rest: Float[Tensor, "V 3"], rim: Int[Tensor, "R"]
+    rest: Float[Tensor, "V 3"], rim: Int[Tensor, "R"], spacing: float = ARM_STEP
 ) -> tuple[Int[Tensor, "M"], Float[Tensor, "M 3"], Float[Tensor, "M 4"], Float[Tensor, "M 3"], Float[Tensor, "M"]]:
-    """Vertex Gaussians of an arm that continues the rim and fades out, as `rim_cap` gives them, and their opacities.
+    """Vertices, offsets, quaternions, scales [m] and opacities of an arm that continues the rim and fades out.
 
-    It is filled past the cap: seen along the arm, the cap would be a disc in a hollow.
+    Its Gaussians lie `spacing` [m] apart at the rim. It is filled: seen along the arm, the hand would be hollow.
     """
     edge, axis = rest[rim], arm_axis(rest, rim)
     slopes = _slopes(rest, rim, axis)
     radius = float((edge - edge.mean(0)).norm(dim=1).mean())
-    n_walls = round(ARM_LENGTH / ARM_STEP * math.log(COARSER) / (COARSER - 1))
-    coarser = [COARSER ** (k / n_walls) for k in range(1, n_walls)]
-    walls = [((ratio - 1) / (COARSER - 1), 1.0, ratio * ARM_STEP) for ratio in coarser]
-    sections = [CAP_HEIGHT + k * FILL_STEP for k in range(1, round((ARM_LENGTH - CAP_HEIGHT) / FILL_STEP))]
-    inner = radius - FILL_STEP  # the balls would blur the arm's outline
+    last = LAST_STEP / spacing
+    n_walls = round(ARM_LENGTH / spacing * math.log(last) / (last - 1))
+    coarser = [last ** (k / n_walls) for k in range(1, n_walls)]
+    walls = [((ratio - 1) / (last - 1), 1.0, ratio * spacing) for ratio in coarser]
+    sections = [k * FILL_STEP for k in range(1, round(ARM_LENGTH / FILL_STEP))]
+    inner = radius - FILL_DEPTH
     n_rings = round(inner / FILL_STEP)
     places = [(k + 0.5) / n_rings * inner / radius for k in range(n_rings)]
     fill = [(height / ARM_LENGTH, place, FILL_STEP) for height in sections for place in places]
@@ -301,8 +287,7 @@ def fading_arm(
         tilt = left * (flare * outward).sum(1, keepdim=True) * axis
         normals.append(axis.expand_as(arm) if inside else normalize(outward - tilt, dim=-1))
         tangents.append(tangent)
-        flat = _discs(length, arm)
-        scales.append(flat[:, :1].expand(-1, 3) if inside else flat)
+        scales.append(_balls(length, arm) if inside else _discs(length, arm))
         seen, layers = OPACITY * (1 - share) ** 2 * (1 + 2 * share), FILL_LAYERS if inside else ARM_LAYERS
         opacities.append(torch.full_like(arm[:, 0], 1 - (1 - seen) ** (1 / layers)))
     quats = surface_frames(torch.cat(normals), torch.cat(tangents))
@@ -332,8 +317,13 @@ def _ring(
 
 def _discs(length: float, rows: Float[Tensor, "M D"]) -> Float[Tensor, "M 3"]:
     """Scales of flat Gaussians that lie `length` apart, one for each of the rows."""
-    spread = torch.full_like(rows[:1, 0], CAP_SPREAD * VERTEX_SPREAD * length / math.sqrt(math.pi))
-    return torch.stack([spread, spread, THICKNESS * spread], 1).expand(len(rows), 3)
+    spread = WALL_SPREAD * VERTEX_SPREAD * length / math.sqrt(math.pi)
+    return rows.new_tensor([spread, spread, THICKNESS * spread]).expand(len(rows), 3)
+
+
+def _balls(length: float, rows: Float[Tensor, "M D"]) -> Float[Tensor, "M 3"]:
+    """The same of balls."""
+    return rows.new_tensor(FILL_SPREAD * length).expand(len(rows), 3)
 
 
 def select(gaussians: CanonicalGaussians, kept: Bool[Tensor, "N"]) -> CanonicalGaussians:

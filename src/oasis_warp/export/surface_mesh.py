@@ -7,9 +7,8 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import normalize
 
-from oasis_warp.avatar.wrist import CAP_HEIGHT
+from oasis_warp.avatar.wrist import rim_axis
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.surface import vertex_normals
 from oasis_warp.core.types import PosedHand
@@ -21,6 +20,8 @@ from oasis_warp.hand.skinning import corrective_coefficients, correctives_per_jo
 from oasis_warp.hand.webxr_rig import TO_WEBXR, Rig, webxr_rig
 from oasis_warp.hand_avatar import Avatar
 
+CAP_HEIGHT = 0.008
+"""Height of the cap over the rim [m]: as much as pictures of a hand leave around it."""
 CAP_CORNER = (0.0125, 0.9875)
 """Texture coordinates of the cap: a corner where the hand has no skin."""
 
@@ -61,11 +62,8 @@ def topology(avatar: Avatar) -> Topology:
 
 def rim_cap_center(hand: HandModel, vertices: Float[Tensor, "V 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
     """The middle of the cap over the wrist [m], and the direction in which it points."""
-    edge = vertices[hand.rim]
-    center = edge.mean(0)
-    axis = normalize(torch.linalg.cross(edge - center, (edge - center).roll(-1, 0)).sum(0), dim=0)
-    axis = axis * torch.sign(axis @ (center - vertices.mean(0)))
-    return center + CAP_HEIGHT * axis, axis
+    axis = rim_axis(vertices, hand.rim)
+    return vertices[hand.rim].mean(0) + CAP_HEIGHT * axis, axis
 
 
 def at_mesh(values: Float[Tensor, "V *D"], mesh: Topology) -> Float[Tensor, "W *D"]:

@@ -15,7 +15,7 @@ from torch.nn.functional import normalize
 
 from oasis_warp.assets import asset
 from oasis_warp.avatar.anchors import MIN_OPACITY, OPACITY, RIM_FADE, batch_anchors
-from oasis_warp.avatar.densify import GROUND_DEPTH
+from oasis_warp.avatar.densify import GROUND_DEPTH, ground_discs
 from oasis_warp.avatar.observation import batch_of_crop
 from oasis_warp.avatar.prior import MeanPrior, Prior
 from oasis_warp.core import surface
@@ -97,10 +97,11 @@ def cover_surface(prediction: Prediction, on: RestSurface) -> Prediction:
     count = (vertex_faces < on_faces.shape[1]).sum(1)[:, None].clamp_min(1)
     around = surface.gather_to_vertices(on_faces, vertex_faces) / count
     quats, scales, fade = (part[:, :n] for part in batch_anchors(rest[None], faces, vertex_faces, rim))
+    discs = ground_discs(DISC_SPREAD * scales)
     return prediction._replace(
         offsets=-GROUND_DEPTH * surface.gathered_normals(rest, faces, vertex_faces).expand_as(prediction.offsets),
         quats=torch.cat([quats, prediction.quats[:, n:]], 1),
-        scales=torch.cat([DISC_SPREAD * scales, prediction.scales[:, n:]], 1),
+        scales=torch.cat([discs, prediction.scales[:, n:]], 1),
         colors=torch.cat([around, on_faces], 1),
         opacities=torch.cat([OPACITY * fade, prediction.opacities[:, n:]], 1),
     )
