@@ -101,7 +101,7 @@ PIPELINE = [
     _of("avatar/creases", "avatar/test_creases", "where_it_is_stretched", "creases go flat where skin is squeezed",
         "(_coarse_areas(posed) / creases.areas).log()", "(creases.areas / _coarse_areas(posed)).log()"),
     _of("avatar/folds", "avatar/test_folds", "paler_and_warmer", "brown spots stay of opened folds",
-        "(around - logs).clamp(0, MOST)", "0 * (around - logs)"),
+        "beyond_shallow(beyond, OPEN)", "0 * beyond"),
     _of("avatar/folds", "avatar/test_folds", "stays_straight", "one finger's bend changes the whole back",
         "torch.lerp(*opened.unbind(-2), folds.between)", "opened.amax(-2).amax(-2, keepdim=True)"),
     _of("avatar/sky", "avatar/test_sky", "stiff_hand", "shadows swim while a stiff hand turns",

@@ -88,14 +88,14 @@ def test_seen_skin_gets_grain_that_the_photo_does_not_show(hand, palm_photo, pai
     on = torch.cat([torch.zeros_like(made.vertex_index, dtype=torch.bool), seen[hand.faces[made.face_index]].all(1)])
     grain = skin_grain(hand, made, 0)[on]
     skin, photo = (g.colors[on].clamp_min(0.01).log().mean(1) for g in (made, with_shade_baked(made)))
-    assert int(on.sum()) > 20000 and 0.01 < float(grain.std()) < 0.05
-    assert float(torch.corrcoef(torch.stack([grain, skin]))[0, 1]) > 0.2
+    assert int(on.sum()) > 20000 and 0.008 < float(grain.std()) < 0.025
+    assert float(torch.corrcoef(torch.stack([grain, skin]))[0, 1]) > 0.1
     assert abs(float(torch.corrcoef(torch.stack([grain, photo]))[0, 1])) < 0.03
 
 
 def test_grain_is_cells_of_skin_that_are_a_seeds_own(hand):
     """White noise on each Gaussian was finer on finer ones, until nothing of it was left."""
-    faces = torch.arange(len(hand.faces)).repeat_interleave(40)
+    faces = torch.arange(len(hand.faces)).repeat_interleave(8)
     weights = torch.rand(len(faces), 3, generator=torch.Generator().manual_seed(0))
     places = at_places(faces[:0], faces, weights / weights.sum(1, keepdim=True))
     grain, again, other = (skin_grain(hand, places, seed) for seed in (0, 0, 1))
@@ -103,11 +103,11 @@ def test_grain_is_cells_of_skin_that_are_a_seeds_own(hand):
     palm, nail = (part[hand.faces[faces]].mean(1) for part in (skin_regions(hand).palm, skin_regions(hand).nail))
     back = (palm < 0.01) & (nail < 0.01)
     assert abs(float(torch.corrcoef(torch.stack([grain, other]))[0, 1])) < 0.02
-    assert 0.035 < float(grain[back].std()) < 0.05 and abs(float(grain.mean())) < 0.005
+    assert 0.017 < float(grain[back].std()) < 0.023 and abs(float(grain.mean())) < 0.002
     assert float(grain[palm > 0.99].std() / grain[back].std()) == pytest.approx(0.5, abs=0.05)
     assert float(grain[nail > 0.9999].abs().max()) < 1e-4
     points = (hand.template[hand.faces[faces]] * places.barycentrics[..., None]).sum(1)[back].double()
-    chosen = torch.randperm(len(points), generator=torch.Generator().manual_seed(1))[:2000]
+    chosen = torch.randperm(len(points), generator=torch.Generator().manual_seed(1))[:500]
     apart, values = torch.cdist(points[chosen], points), grain[back].double()
     alike = [
         float((values[chosen, None] * values)[(apart > low * CELL) & (apart < high * CELL)].mean() / values.var())
