@@ -18,7 +18,7 @@ from oasis_warp.adaptation.adapt import Adaptation, adapt, add_detail
 from oasis_warp.adaptation.photo_view import match_photo
 from oasis_warp.adaptation.rim_shade import limit_shade, match_rim
 from oasis_warp.adaptation.smooth_shade import spread_shade
-from oasis_warp.adaptation.unseen_skin import SPACING, OwnSkin, PaintedSkin, paint_unseen
+from oasis_warp.adaptation.unseen_skin import COARSE, SPACING, OwnSkin, PaintedSkin, paint_unseen
 from oasis_warp.avatar.densify import coarsen
 from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.avatar.prior import Prior
@@ -300,10 +300,13 @@ def _finish(
 
     A single photo is also matched in its own view, at the size of its detail: several would undo each other's.
     """
-    gaussians, painted, first = adaptation.gaussians, None, crops[0]
+    gaussians, painted, first, spacing = adaptation.gaussians, None, crops[0], ARM_STEP
     if config.unseen == "painted":
         with stage("painting"):
-            painted = paint_unseen(hand, gaussians, adaptation.guess, first, adaptation.trusted, seed=config.seed)
+            spacing = COARSE if config.size != "auto" and config.size <= COARSE_SIZE else SPACING
+            painted = paint_unseen(
+                hand, gaussians, adaptation.guess, first, adaptation.trusted, seed=config.seed, spacing=spacing
+            )
             gaussians = painted.gaussians
     rest, lights = first.rest.vertices, adaptation.lights
     if lights is not None:
@@ -314,8 +317,8 @@ def _finish(
         if len(close) == 1:
             with stage("detail"):
                 gaussians = match_photo(hand, gaussians, close[0], lights[0])
-    spacing = SPACING if painted else ARM_STEP
-    return adaptation._replace(gaussians=close_wrist(hand, gaussians, rest, spacing), lights=lights), painted
+    closed = close_wrist(hand, gaussians, rest, min(spacing, ARM_STEP))
+    return adaptation._replace(gaussians=closed, lights=lights), painted
 
 
 def _guess(

@@ -29,8 +29,9 @@ JOIN_DETAIL, JOIN_REACH = 0.004, 0.04
 the person's mean colours [m]."""
 MAX_DIFFERENT = 0.3
 """Difference of the logarithms from the person's mean colours that is carried on: more is dirt, a ring or a shadow."""
-SPACING = 0.55e-3
-"""Side of the squares that are as large as the parts of faces are at most [m]."""
+SPACING, COARSE = 0.55e-3, 2e-3
+"""Side of the squares that are as large as the parts of faces are at most [m]: a pixel of a fist that fills 256 px. And
+the same where pictures of 256 px of an open hand are all that is wanted: faces stay whole."""
 SHOWS_FORM = 0.3
 """Cosine between normal and view from which a photo shows the forms of skin that it shows on a slant."""
 ON_PALM, ON_BACK = 1.6, 1.25
@@ -91,6 +92,7 @@ def paint_unseen(
     observations: VertexObservations,
     *,
     seed: int,
+    spacing: float = SPACING,
 ) -> PaintedSkin:
     """Replace the colours of what was not seen.
 
@@ -108,6 +110,7 @@ def paint_unseen(
         crop: The first photo.
         observations: What the photos show, as far as it is skin: `Adaptation.trusted`.
         seed: Seed of the detail.
+        spacing: Side of the squares that are as large as the parts of faces are at most [m].
     """
     rest = crop.rest.vertices
     faces = hand.faces.to(rest.device)
@@ -124,7 +127,7 @@ def paint_unseen(
     smooth = inpaint(rest, faces, difference, sure, detail=JOIN_DETAIL, fade=JOIN_REACH)
     bed = _nail_color(tone, seen, confidence * nail, nail.sum())
 
-    fine = densify(gaussians, rest, faces, _parts(gaussians, rest, faces), SKIN).gaussians
+    fine = densify(gaussians, rest, faces, _parts(gaussians, rest, faces, spacing), SKIN).gaussians
     unknown = (1 - first.visibility * first.facing / SHOWS_FORM).clamp(0, 1)
     skin = OwnSkin(tone, *_clarities(hand, observations))
     form = _skin_form(hand, rest, seed) * unknown[:, None]
@@ -149,7 +152,7 @@ def paint_hand(
         seed: Seed of the detail.
     """
     faces = hand.faces.to(rest.device)
-    fine = densify(guess, rest, faces, _parts(guess, rest, faces), SKIN).gaussians
+    fine = densify(guess, rest, faces, _parts(guess, rest, faces, SPACING), SKIN).gaussians
     nails = skin.tone.log_nail + _nail_form(hand, rest)
     painted, _ = _paint_on(hand, fine, rest, skin.tone.log_skin + _skin_form(hand, rest, seed), nails, skin, seed)
     return fine._replace(colors=painted.exp().clamp(MIN_COLOR, 1), shade=None)
@@ -222,10 +225,12 @@ def _nail_color(tone: SkinTone, seen: Tensor, weight: Float[Tensor, "V"], total:
     return torch.lerp(tone.log_nail, own, known / (known + KNOWN_NAIL))
 
 
-def _parts(gaussians: CanonicalGaussians, rest: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Int[Tensor, "F"]:
+def _parts(
+    gaussians: CanonicalGaussians, rest: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], spacing: float
+) -> Int[Tensor, "F"]:
     """Parts an edge of the faces that have one Gaussian; those that show a photo's detail have more."""
     n_own = torch.bincount(gaussians.face_index, minlength=len(faces))
-    return torch.where(n_own == 1, parts_for_spacing(rest, faces, SPACING), 1)
+    return torch.where(n_own == 1, parts_for_spacing(rest, faces, spacing), 1)
 
 
 def _skin_detail(detail: SkinDetail, palm: Float[Tensor, "N 1"] | float) -> Float[Tensor, "N 3"]:
