@@ -17,7 +17,7 @@ from oasis_warp.data.pictures import write_video
 from oasis_warp.export import export_avatar
 from oasis_warp.hand.mano import ManoPose, hand_pose, mano_surface, read_mano
 from oasis_warp.hand.poses import named_pose
-from oasis_warp.hand.skinning import bone_transforms
+from oasis_warp.hand.skinning import bone_transforms, skin
 from oasis_warp.hand.webxr_rig import TO_WEBXR, webxr_rig
 from oasis_warp.hand_avatar import Avatar
 from oasis_warp.motion import Motion, jitter, read_motion, recording, resample, smooth
@@ -321,7 +321,7 @@ def test_the_filter_keeps_the_motion_and_takes_away_the_noise(avatars):
     shaken = motion._replace(angles=motion.angles + noise)
 
     def points(of):
-        posed = avatar.mesh(poses(of))
+        posed = skin(avatar.hand, avatar.rest, poses(of))
         return torch.cat([posed.joints, posed.tips], 1)
 
     true, found = points(motion), points(smooth(shaken))

@@ -53,7 +53,7 @@ BEFORE_RIM, ASIDE = 0.008, 0.004
 """Stretch of skin before the rim whose direction the arm follows, and width along the rim of what is averaged [m]."""
 STRAIGHT = 0.008
 """Length over which the arm turns from the direction of the skin before the rim into its own [m]: with a sudden turn
-outlines had a step. It and `FIRST_RING` were set by eye on two hands."""
+outlines had a step. Set by eye on two hands."""
 ARM_STEP, LAST_STEP = 0.001, 0.0016
 """Distance of the arm's Gaussians at the rim, where skin is not finer, and at its end [m]: with 2 mm at the rim the
 skin's detail ended there, with 3 mm at the end the arm was blurred."""
