@@ -21,7 +21,7 @@ skin."""
 LONGER = 1.3
 """How much longer cells are across fingers than along them."""
 TRIED = 3.0
-"""Points that are tried for each square of that side; two thirds of all cells then have no room for another."""
+"""Points that are tried for each square of that side; a sixth of them become cells."""
 FURROW = 0.4
 """Width of furrows over `CELL`, as a difference of the distances to two cells."""
 MEAN, DEVIATION = 0.717, 0.339

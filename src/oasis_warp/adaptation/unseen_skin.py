@@ -30,8 +30,8 @@ the person's mean colours [m]."""
 MAX_DIFFERENT = 0.3
 """Difference of the logarithms from the person's mean colours that is carried on: more is dirt, a ring or a shadow."""
 SPACING, COARSE = 0.55e-3, 2e-3
-"""Side of the squares that are as large as the parts of faces are at most [m]: a pixel of a fist that fills 256 px. And
-the same where pictures of 256 px of an open hand are all that is wanted: faces stay whole."""
+"""Side of the squares that are as large as the parts of faces are at most [m]: 2 to 3 px of a fist that fills 512 px.
+And the same where pictures of 256 px of an open hand are all that is wanted: faces stay whole."""
 SHOWS_FORM = 0.3
 """Cosine between normal and view from which a photo shows the forms of skin that it shows on a slant."""
 ON_PALM, ON_BACK = 1.6, 1.25
