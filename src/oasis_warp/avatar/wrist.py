@@ -63,7 +63,7 @@ to the skin they blur the arm's outline."""
 ARM_LAYERS, FILL_LAYERS = 1.5, 12.0
 """Numbers of the arm's Gaussians and of balls one behind the other, each of them so much fainter. There are more balls,
 so the arm is opaque for 6 cm and then fades."""
-RIM_PARTS = -1 / 3, 0.0, 1 / 3
+RIM_PARTS = -0.4, -0.2, 0.0, 0.2, 0.4
 """Places of Gaussians along the edges at a vertex of the rim, as shares of the edge: one on each vertex makes teeth."""
 RIM_SPREAD = 0.8
 """Standard deviation of the rim's Gaussians over their distance."""
