@@ -122,7 +122,7 @@ PIPELINE = [
         "tone.log_skin + form + smooth, bed +", "tone.log_skin + form, bed +"),
     _of("adaptation/unseen_skin", "adaptation/test_unseen_skin", "own_view", "paint over slanted skin",
         "gaussians.shade * beyond.exp()", "gaussians.shade"),
-    _of("adaptation/skin_detail", "adaptation/test_unseen_skin", "same_detail", "texture coordinates of another corner",
+    _of("adaptation/skin_detail", "adaptation/test_skin_detail", "same_detail", "texture coordinates of another corner",
         "uv[uv_faces.flatten()[corners]]", "uv[uv_faces.flatten()[corners - 1]]"),
     _of("network/prior", "network/test_network_prior", "floats", "Gaussians above the surface kept",
         "above.clamp(max=0) * normals", "above * normals"),

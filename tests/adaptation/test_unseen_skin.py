@@ -7,23 +7,18 @@ from synthetic import PALM_TO_CAMERA, crop_of
 from oasis_warp.adaptation import reliability, scraps
 from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.adaptation.reliability import mask_unreliable
-from oasis_warp.adaptation.skin_detail import flush_shade, relief, sample_detail
-from oasis_warp.adaptation.skin_grain import CELL, skin_grain
-from oasis_warp.adaptation.unseen_skin import SEEN, SPACING, _clarities, _skin_detail, paint_hand, paint_unseen
+from oasis_warp.adaptation.skin_detail import sample_detail
+from oasis_warp.adaptation.skin_grain import skin_grain
+from oasis_warp.adaptation.unseen_skin import SEEN, SPACING, _clarities, paint_hand, paint_unseen
 from oasis_warp.avatar.anchors import RIM_FADE, vertex_colors, vertex_to_gaussians
-from oasis_warp.avatar.appearance import label_regions, region_colors, skin_regions
+from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.densify import coarsen
 from oasis_warp.avatar.observation import inner_mask, observe
 from oasis_warp.avatar.pose import with_shade_baked
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig
-from oasis_warp.core.types import CanonicalGaussians
-from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import depth_map
-
-MIDDLE, RING = 4, 10
-"""First joints of these fingers."""
 
 
 @pytest.fixture(scope="module")
@@ -31,15 +26,6 @@ def palm_photo(hand):
     crop, _, _ = crop_of(hand, region_colors(label_regions(hand), 0.03), orientation=PALM_TO_CAMERA)
     prior = MeanPrior(hand)(crop)
     return crop, adapt(hand, [prior], [crop], AdaptConfig(texture_steps=5))
-
-
-def at_places(vertices, faces, barycentrics):
-    """Gaussians of which only the places count."""
-    count = len(vertices) + len(faces)
-    ones = torch.ones(count, 3)
-    return CanonicalGaussians(
-        vertices, torch.zeros(len(vertices), 3), faces, barycentrics, torch.ones(count, 4), ones, ones[:, 0], ones
-    )
 
 
 def paint(hand, palm_photo, gaussians=None, seed=0, observations=None):
@@ -93,56 +79,10 @@ def test_seen_skin_gets_grain_that_the_photo_does_not_show(hand, palm_photo, pai
     assert abs(float(torch.corrcoef(torch.stack([grain, photo]))[0, 1])) < 0.03
 
 
-def test_grain_is_cells_of_skin_that_are_a_seeds_own(hand):
-    """White noise on each Gaussian was finer on finer ones, until nothing of it was left."""
-    faces = torch.arange(len(hand.faces)).repeat_interleave(8)
-    weights = torch.rand(len(faces), 3, generator=torch.Generator().manual_seed(0))
-    places = at_places(faces[:0], faces, weights / weights.sum(1, keepdim=True))
-    grain, again, other = (skin_grain(hand, places, seed) for seed in (0, 0, 1))
-    assert torch.equal(grain, again)
-    palm, nail = (part[hand.faces[faces]].mean(1) for part in (skin_regions(hand).palm, skin_regions(hand).nail))
-    back = (palm < 0.01) & (nail < 0.01)
-    assert abs(float(torch.corrcoef(torch.stack([grain, other]))[0, 1])) < 0.02
-    assert 0.017 < float(grain[back].std()) < 0.023 and abs(float(grain.mean())) < 0.002
-    assert float(grain[palm > 0.99].std() / grain[back].std()) == pytest.approx(0.5, abs=0.05)
-    assert float(grain[nail > 0.9999].abs().max()) < 1e-4
-    points = (hand.template[hand.faces[faces]] * places.barycentrics[..., None]).sum(1)[back].double()
-    chosen = torch.randperm(len(points), generator=torch.Generator().manual_seed(1))[:500]
-    apart, values = torch.cdist(points[chosen], points), grain[back].double()
-    alike = [
-        float((values[chosen, None] * values)[(apart > low * CELL) & (apart < high * CELL)].mean() / values.var())
-        for low, high in ((0.0, 0.2), (1.5, 3.0))
-    ]
-    assert alike[0] > 0.5 and abs(alike[1]) < 0.05, alike
-
-
 def test_the_unseen_back_gets_detail_that_a_mean_has_not(hand, palm_photo, painted):
     where = unseen_back(hand, painted)
     before, after = (vertex_colors(g, len(where)) for g in (palm_photo[1].gaussians, painted.gaussians))
     assert detail_of(hand, after, where) > 1.5 * detail_of(hand, before, where)
-
-
-def test_knuckles_and_pads_stand_out_of_unseen_skin():
-    """Painted hands were slabs: detail of 4 to 8 px, where tendons and pads are, was at .4 of real hands'."""
-    hand = bundled_hand()
-    palm = label_regions(hand).palm
-    first, other = (relief(hand, seed) for seed in (0, 1))
-    at_knuckle = (hand.template - hand.joints[MIDDLE]).norm(dim=1)
-    knuckle = first[(at_knuckle < 0.015) & (palm < 0.05)].max()
-    between = first[(hand.template - hand.joints[[RING, MIDDLE]].mean(0)).norm(dim=1) < 0.015].min()
-    assert float(knuckle) > 0.2 and float(between) < -0.2
-    on_palm = first[palm > 0.999]
-    assert float(on_palm.max()) > 0.3 and -0.36 < float(on_palm.min()) < -0.3
-    assert not torch.equal(first, other) and torch.equal(first, relief(hand, 0))
-
-
-def test_blotches_of_blood_are_a_seeds_own_and_strongest_on_the_palm():
-    hand = bundled_hand()
-    palm = label_regions(hand).palm
-    first, other = (flush_shade(hand, seed)[:, 1] for seed in (0, 1))
-    assert not torch.equal(first, other)
-    assert 0.03 < float(first[palm > 0.999].std()) < 0.05
-    assert float(first.mean().abs()) < 0.005
 
 
 def test_a_smooth_back_says_little_of_its_palm(hand, palm_photo):
@@ -226,13 +166,6 @@ def test_no_step_shows_where_painted_skin_meets_seen_skin(hand, palm_photo):
     assert float(step[crossing].mean()) < 1.5 * float(step[inside].mean())
 
 
-def test_nails_are_where_the_hand_model_has_them(hand):
-    index = torch.arange(len(hand.template))
-    detail = sample_detail(hand, at_places(index, index[:0], torch.zeros(0, 3)), 0)
-    assert float(detail.plate[hand.nail > 0.95].mean()) > 0.8
-    assert float(detail.plate[label_regions(hand).palm > 0.9].max()) < 0.1
-
-
 def test_a_nail_ends_in_a_pale_free_edge_and_is_redder_than_its_lunula(hand, painted):
     """One flat tone, a nail looked like plastic."""
     nails = sample_detail(hand, painted.gaussians, 0)
@@ -263,28 +196,6 @@ def test_a_hand_that_is_painted_all_over_has_what_unseen_skin_is_given(hand, pal
     assert detail_of(hand, vertex_colors(whole[0], len(back)), seen) > 1.7 * detail_of(
         hand, vertex_colors(painted.gaussians, len(back)), seen
     )
-
-
-def test_palm_lines_are_one_persons_and_take_turns_with_the_seed(hand):
-    """Mixed place by place as the skin is, a line ended where another person's began."""
-    index = torch.arange(len(hand.template))
-    lines = [sample_detail(hand, at_places(index, index[:0], torch.zeros(0, 3)), seed).fold for seed in range(4)]
-    torch.testing.assert_close(lines[0], lines[2])
-    torch.testing.assert_close(lines[1], lines[3])
-    palm = (hand.segment == 0) & (skin_regions(hand).palm > 0.95)
-    dark = [line[palm] > 0.5 for line in lines[:2]]
-    assert all(0.02 < float(where.float().mean()) < 0.3 for where in dark)
-    assert not torch.equal(*dark)
-
-
-def test_the_same_place_has_the_same_detail_as_a_vertex_and_on_a_face(hand):
-    """A wrong corner of the texture coordinates would show another place's skin; islands' rims have two."""
-    index = torch.arange(len(hand.template))
-    faces = torch.arange(0, len(hand.faces), 7)
-    corner = torch.tensor([[1.0, 0.0, 0.0]]).repeat(len(faces), 1)
-    detail = sample_detail(hand, at_places(index, faces, corner), 0).skin
-    apart = (detail[len(index) :] - detail[hand.faces[faces, 0]]).abs().amax(1)
-    assert float((apart < 1e-5).float().mean()) > 0.97
 
 
 def test_without_shade_what_the_photo_shows_on_a_slant_stays(hand, palm_photo):
@@ -416,28 +327,3 @@ def test_the_palm_beside_a_finger_that_lies_on_it_is_unreliable(hand, monkeypatc
             patch.setattr(reliability, "FINGER_GAP", torch.inf)
             shares[name] = float((mask_unreliable(hand, crop.image, crop).mask - sure).sum() / crop.mask.sum())
     assert shares["fist"] > 0.02 and shares["open"] < 0.01
-
-
-def test_no_finger_has_dark_bars_on_its_palm_side():
-    """One of the maps' hands has dark skin, in whose creases pigment lies: to .75 of the skin around, on one finger."""
-    hand = bundled_hand()
-    palm = label_regions(hand).palm[hand.faces].mean(1)
-    faces, middle = torch.arange(len(hand.faces)), torch.full(hand.faces.shape, 1 / 3)
-    bones = hand.segment[hand.faces[:, 0]]
-    for seed in range(3):
-        detail = sample_detail(hand, at_places(faces[:0], faces, middle), seed)
-        added = _skin_detail(detail, palm[:, None]).mean(1)
-        darkest = [float(added[(bones == bone) & (palm > 0.7)].quantile(0.05)) for bone in range(1, 16)]
-        assert -0.2 < min(darkest) < -0.05, seed
-
-
-def test_fingers_have_no_frames_on_their_palm_side():
-    """The maps' red pads in a frame of paint, and creases as wide as bars, were nails and rings on straight fingers."""
-    hand = bundled_hand()
-    palm, vertices = label_regions(hand).palm, torch.arange(len(hand.template))
-    pads = (palm > 0.95) & (hand.segment > 0)
-    for seed in range(3):
-        detail = sample_detail(hand, at_places(vertices, vertices[:0], torch.zeros(0, 3)), seed)
-        added = _skin_detail(detail, palm[:, None]).mean(1, keepdim=True)
-        wide = surface.smooth_over_mesh(added, surface.mesh_edges(hand.faces), 6)[pads]  # over 5 mm
-        assert 0.005 < float(wide.std()) < 0.025, seed  # it was .037

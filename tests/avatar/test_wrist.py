@@ -1,4 +1,4 @@
-"""The end of the hand: closed by a cap, and continued by an arm that fades."""
+"""The end of the hand: opaque, and continued by an arm that fades."""
 
 import math
 

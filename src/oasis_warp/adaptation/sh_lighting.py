@@ -187,7 +187,7 @@ def add_shade(
     missing = (seen.colors.clamp_min(MIN_COLOR) / known.clamp_min(MIN_COLOR)).log()
     on = posed_lighting(rest, crop.posed.vertices, faces, light)
     reliable = observe(hand, sure).confidence
-    fade = rim_fade(rest[None], hand.rim.to(rest.device))[0]  # the cap has no shade
+    fade = rim_fade(rest[None], hand.rim.to(rest.device))[0]  # the arm has no shade
     doubt = (seen.confidence - reliable * exposure_confidence(on)) * fade
     occluded = inpaint(rest, faces, missing, doubt, OCCLUDER_FADE / 3, OCCLUDER_FADE)
     shade = occluded.clamp(-MAX_LOG_SHADE, MAX_LOG_SHADE).exp()

@@ -40,7 +40,6 @@ def skin_grain(hand: HandModel, gaussians: CanonicalGaussians, seed: int) -> Flo
     Worley's cellular noise (1996) on the surface of the mean hand: with distances d1 <= d2 to the nearest two cells,
     furrows lie where d2 - d1 is small.
     """
-    on_faces = len(gaussians.vertex_index)
     index, place = gaussians.face_index.cpu(), gaussians.barycentrics.cpu()
     template, faces = hand.template.cpu(), hand.faces.cpu()
     points = (template[faces[index]] * place[..., None]).sum(1)
@@ -49,7 +48,7 @@ def skin_grain(hand: HandModel, gaussians: CanonicalGaussians, seed: int) -> Flo
     share = (1 - (1 - ON_PALM) * regions.palm) * (1 - regions.nail)
     values = torch.from_numpy(values).to(gaussians.colors)
     shares = vertex_to_gaussians(share.to(values)[:, None], hand.faces.to(values.device), gaussians)[:, 0]
-    return torch.cat([values.new_zeros(on_faces), values]) * shares
+    return torch.cat([values.new_zeros(len(gaussians.vertex_index)), values]) * shares
 
 
 def _grain_at(cells: cKDTree, points: np.ndarray, seed: int) -> np.ndarray:
@@ -84,14 +83,14 @@ def _apart(points: np.ndarray, distance: float) -> np.ndarray:
     """Whether each point is kept: in their order, those that no kept one is nearer to than `distance`."""
     pairs = cKDTree(points).query_pairs(distance, output_type="ndarray")
     first, second = pairs.min(1), pairs.max(1)
-    kept, open_ = np.zeros(len(points), bool), np.ones(len(points), bool)
-    while open_.any():
-        both = open_[first] & open_[second]
+    kept, undecided = np.zeros(len(points), bool), np.ones(len(points), bool)
+    while undecided.any():
+        both = undecided[first] & undecided[second]
         first, second = first[both], second[both]
-        later = np.zeros_like(open_)
+        later = np.zeros_like(undecided)
         later[second] = True
-        now = open_ & ~later  # nothing before them is open
+        now = undecided & ~later  # all before them, and near, are decided
         kept |= now
-        open_ &= ~now
-        open_[second[now[first]]] = False
+        undecided &= ~now
+        undecided[second[now[first]]] = False
     return kept

@@ -38,7 +38,7 @@ AVERAGED = 100
 """Number of nearest places of that skin, 6 mm around; detail is the difference of one from their mean. With 32 the
 blotches of a back ended at the rim."""
 PLACES = 4000
-"""Most places of skin that means are taken of; with coarse skin there are so many."""
+"""About as many places of fine skin count for these means, as many as coarse skin has."""
 DARKEST = 0.02
 """Colours are clamped to it before their logarithm is taken [sRGB]."""
 CONTRAST = 0.045
@@ -147,15 +147,15 @@ def _centers(gaussians: CanonicalGaussians, rest: Tensor, faces: Tensor) -> Floa
 
 def _average(logs: Float[Tensor, "N 3"], places: Tensor, at: Float[Tensor, "M 3"]) -> tuple[Tensor, Tensor]:
     """Mean of the skin's logarithms around each point, and the share of its detail that has no more than `CONTRAST`."""
-    some = _some(torch.arange(len(places), device=places.device))
+    some = _thinned(torch.arange(len(places), device=places.device))
     around = logs[some][_nearest(at, places[some], AVERAGED)]
     average = around.mean(1)
     contrast = (around - average[:, None]).square().mean((1, 2)).sqrt()
     return average, (CONTRAST / contrast.clamp_min(CONTRAST))[:, None]
 
 
-def _some(index: Int[Tensor, "N"]) -> Int[Tensor, "M"]:
-    """About as many places as coarse skin has there."""
+def _thinned(index: Int[Tensor, "N"]) -> Int[Tensor, "M"]:
+    """Every k-th, `PLACES` or so."""
     return index[:: max(1, round(len(index) / PLACES))]
 
 
@@ -180,7 +180,7 @@ def _continued(
     centers = _centers(gaussians, rest, faces)
     far = torch.cdist(centers, rest[rim]).amin(1)
     skin = (fade >= 1) & (far < MIRRORED)
-    start = _some(torch.nonzero(skin & (far < 2 * RIM_FADE))[:, 0])
+    start = _thinned(torch.nonzero(skin & (far < 2 * RIM_FADE))[:, 0])
     near = torch.cdist(points, centers[start]).square()
     spread = SMOOTHING**2 + near.amin(1, keepdim=True)
     mean = torch.softmax(-0.5 * near / spread, 1) @ gaussians.colors[start]
