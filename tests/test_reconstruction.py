@@ -199,7 +199,7 @@ def test_palm_and_back_show_twice_as_much_as_the_palm_and_the_avatar_has_the_det
         lit = [(step.gaussians, step.lights[k]) for step in seen] + [(made.avatar.gaussians, own.light)]
         avatars = (make_avatar(own.fit, made.avatar.surface_offsets, crop, *each) for each in lit)
         before, after, finished = (detail_error(shown(avatar, own, crop), crop) for avatar in avatars)
-        assert after < 0.9 * before and finished < 0.95 * before, (k, before, after, finished)
+        assert after < 0.9 * before and finished < 0.75 * before, (k, before, after, finished)
 
 
 def shown(avatar, photo, crop):

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.adaptation.adapt import Adaptation, adapt, add_detail
-from oasis_warp.adaptation.photo_view import match_photo
+from oasis_warp.adaptation.photo_view import match_photos
 from oasis_warp.adaptation.rim_shade import limit_shade, match_rim
 from oasis_warp.adaptation.smooth_shade import spread_shade
 from oasis_warp.adaptation.unseen_skin import COARSE, SPACING, OwnSkin, PaintedSkin, paint_unseen
@@ -296,10 +296,7 @@ def _finish(
     hand: HandModel, adaptation: Adaptation, crops: Sequence[HandCrop], close: Sequence[HandCrop],
     config: ReconstructConfig, stage: Stage,
 ) -> tuple[Adaptation, PaintedSkin | None]:  # fmt: skip
-    """Paint what no photo shows and close the wrist: the adaptation, and what was painted.
-
-    A single photo is also matched in its own view, at the size of its detail: several would undo each other's.
-    """
+    """Paint what no photo shows, match the photos' views and close the wrist: the adaptation, and what was painted."""
     gaussians, painted, first, spacing = adaptation.gaussians, None, crops[0], ARM_STEP
     if config.unseen == "painted":
         with stage("painting"):
@@ -314,9 +311,8 @@ def _finish(
         gaussians, spread = spread_shade(hand, gaussians, first, lights[0])
         lights = (match_rim(hand, gaussians, first, spread), *lights[1:])
         lights = tuple(end_shade(hand, light, rest) for light in lights)
-        if len(close) == 1:
-            with stage("detail"):
-                gaussians = match_photo(hand, gaussians, close[0], lights[0])
+        with stage("detail"):
+            gaussians = match_photos(hand, gaussians, close, lights, adaptation.gains)
     closed = close_wrist(hand, gaussians, rest, min(spacing, ARM_STEP))
     return adaptation._replace(gaussians=closed, lights=lights), painted
 
