@@ -254,31 +254,45 @@ COUNT = """
   const draw = viewer.draw, wait = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
   let count = 0;
   viewer.draw = (...given) => draw(...given).finally(() => count++);
+  const busy = () => {
+    const values = new Float32Array(50000), end = performance.now() + 2000;
+    let rounds = 0;
+    for (; performance.now() < end; rounds++) {
+      for (let k = 1; k < values.length; k++) values[k] = 0.5 * values[k - 1] + Math.sqrt(k);
+    }
+    postMessage(rounds);
+  };
+  const code = URL.createObjectURL(new Blob([`(${busy})()`]));
+  const rounds = () => new Promise((resolve) => new Worker(code).onmessage = ({ data }) => resolve(data / 2));
+  const speed = async () => (await Promise.all([rounds(), rounds()])).reduce((a, b) => a + b) / 2;
+  const first = await speed();
   byId("play").click();
   await wait(3000); // the resolution follows
   const start = performance.now(), before = count;
   await wait(5000);
   const rate = (1000 * (count - before)) / (performance.now() - start);
-  fetch("/rate", { method: "POST", body: `${rate} ${viewer.canvas.clientWidth} ${viewer.canvas.clientHeight}` });
+  byId("play").click();
+  await wait(1000);
+  const body = [rate, (first + await speed()) / 2, viewer.canvas.clientWidth, viewer.canvas.clientHeight].join(" ");
+  fetch("/rate", { method: "POST", body });
 }, (error) => fetch("/failed", { method: "POST", body: String(error) }))</script>
 """
-QUIET_RATE = 25
-"""Pictures a second that two free cores draw of a moving hand (docs/viewing.md)."""
+QUIET_SHARE = 0.0072
+"""Pictures of a moving hand over rounds of the loop `busy` that two threads do at once, each, in the same time."""
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
 def test_a_moving_hand_is_fluent_without_a_graphics_card(pages, tmp_path):
-    """Half of what two free cores draw, times the share that other processes leave of them."""
+    """A picture takes at most twice the work that it took when this was written, whatever else the machine does."""
     page = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", pages["right"])
     with browser_with(page.replace("</body>", COUNT + "</body>"), "processor", tmp_path / "profile") as received:
         path, body = received.get(timeout=100)
     assert path == "/rate", body
-    rate, width, height = map(float, body.split())
+    rate, speed, width, height = map(float, body.split())
     assert min(width, height) >= 500
-    cores, load = os.cpu_count() or 1, os.getloadavg()[0]
-    assert rate > QUIET_RATE / 2 * min(1, cores / 2) * min(1, cores / max(load, 1)), (rate, load)
-    print(f"{rate:.1f} pictures a second of {width:.0f} x {height:.0f}, load {load:.1f} on {cores} cores")
+    print(f"{rate:.1f} pictures a second of {width:.0f} x {height:.0f}, {speed:.0f} rounds a second")
+    assert rate / speed > QUIET_SHARE / 2, (rate, speed)
 
 
 def test_all_named_poses_are_on_the_page(pages):

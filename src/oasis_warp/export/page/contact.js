@@ -19,7 +19,7 @@ function makeContact({ data, faces, nVertices: n }) {
   return {
     n, nParts, members, starts, give, part, rings, beside: beside.map((near) => [...near]),
     allowed: parts.map((p) => parts.filter((q) => (bits[groups * p + (q >> 5)] >>> (q & 31)) & 1)),
-    samples: data.arrays.contactSamples,
+    samples: data.arrays.contactSamples, wide: secondNeighbours(rings, n), close: new Uint8Array(n),
     outward: data.side === "left" ? -1 : 1, boxes: new Float64Array(BOX * nParts), met: Array(nParts),
     reached: new Uint8Array(nParts), normals: new Float32Array(3 * n), others: new Int32Array(n),
     shifts: new Float32Array(3 * n), wanted: new Float32Array(4 * n), mean: new Float32Array(4 * n),
@@ -36,9 +36,23 @@ function neighbours(faces, n) {
       around[faces[f + ((k + 1) % 3)]].add(faces[f + k]);
     }
   }
-  const start = new Uint32Array(n + 1);
-  around.forEach((own, v) => (start[v + 1] = start[v] + own.size));
-  return { start, index: Uint16Array.from(around.flatMap((own) => [...own])) };
+  return startsOf(around.map((own) => [...own]));
+}
+
+// The same of vertices at most two edges away, without those that are named twice.
+function secondNeighbours(rings, n) {
+  const around = Array.from({ length: n }, (_, v) => {
+    const near = new Set();
+    eachNear(rings, v, (j) => near.add(j));
+    return [...near];
+  });
+  return startsOf(around);
+}
+
+function startsOf(around) {
+  const start = new Uint32Array(around.length + 1);
+  around.forEach((own, v) => (start[v + 1] = start[v] + own.length));
+  return { start, index: Uint16Array.from(around.flat()) };
 }
 
 function eachNear({ start, index }, v, use) {
@@ -55,12 +69,13 @@ function giveWay({ data, posed, faces, around, start, contact }, angles) {
   if (bent === 0) return;
   boxParts(contact, posed, faces);
   if (!meetParts(contact)) return;
-  const { n, part, reached, normals, shifts, mean } = contact;
+  const { n, part, reached, normals, shifts, mean } = contact, sum = [0, 0, 0];
   for (let v = 0; v < n; v++) {
     if (!reached[part[v]]) continue;
-    const sum = [0, 0, 0];
+    sum.fill(0);
     for (let e = start[v]; e < start[v + 1]; e++) addArea(posed, faces, around[e], sum);
-    normals.set(unit(sum, contact.outward), 3 * v);
+    const length = contact.outward * Math.sqrt(dot(sum, sum)) || 1;
+    for (let d = 0; d < 3; d++) normals[3 * v + d] = sum[d] / length;
   }
   if (!findOthers(contact, posed)) return;
   shifts.fill(0);
@@ -157,16 +172,14 @@ const facing = (normals, i, j) =>
   normals[3 * i] * normals[3 * j] + normals[3 * i + 1] * normals[3 * j + 1] + normals[3 * i + 2] * normals[3 * j + 2];
 
 // Of the last nearest vertex and those around it the one that is nearest to v now, and how deep v lies under it.
-function nearestNow({ rings: { start, index }, normals, others, shifts }, points, v) {
+function nearestNow({ wide: { start, index }, normals, others, shifts }, points, v) {
   const last = others[v];
   const x = points[3 * v] + shifts[3 * v], y = points[3 * v + 1] + shifts[3 * v + 1], z = points[3 * v + 2] + shifts[3 * v + 2];
   let other = last, squared = Infinity;
   for (let e = start[last]; e < start[last + 1]; e++) {
-    for (let k = start[index[e]]; k < start[index[e] + 1]; k++) {
-      const j = index[k], rx = points[3 * j] + shifts[3 * j] - x, ry = points[3 * j + 1] + shifts[3 * j + 1] - y;
-      const rz = points[3 * j + 2] + shifts[3 * j + 2] - z, distance = rx * rx + ry * ry + rz * rz;
-      if (distance < squared && (j === last || facing(normals, v, j) < OPPOSED)) (squared = distance), (other = j);
-    }
+    const j = index[e], rx = points[3 * j] + shifts[3 * j] - x, ry = points[3 * j + 1] + shifts[3 * j + 1] - y;
+    const rz = points[3 * j + 2] + shifts[3 * j + 2] - z, distance = rx * rx + ry * ry + rz * rz;
+    if (distance < squared && (j === last || facing(normals, v, j) < OPPOSED)) (squared = distance), (other = j);
   }
   const o = 3 * other, rx = points[o] + shifts[o] - x, ry = points[o + 1] + shifts[o + 1] - y;
   const depth = rx * normals[o] + ry * normals[o + 1] + (points[o + 2] + shifts[o + 2] - z) * normals[o + 2];
@@ -199,15 +212,17 @@ function leadOut(contact, points) {
 }
 
 // Add the mean of the shifts over two rings, and hold each vertex to what it can give.
-function spreadShifts({ n, rings, part, reached, give, shifts, wanted, mean }) {
+function spreadShifts({ n, rings, wide, close, give, shifts, wanted, mean }) {
   const sum = [0, 0, 0, 0];
+  markAround(rings, wanted, n, close);
   for (let v = 0; v < n; v++) {
-    if (!reached[part[v]]) continue; // its mean is 0
-    meanAround(rings, wanted, v, sum);
+    sum.fill(0);
+    if (close[v]) meanAround(rings, wanted, v, sum);
     for (let k = 0; k < 4; k++) mean[4 * v + k] = sum[k];
   }
+  markAround(wide, wanted, n, close);
   for (let v = 0; v < n; v++) {
-    if (!reached[part[v]]) continue;
+    if (!close[v]) continue; // its mean is 0
     meanAround(rings, mean, v, sum);
     const share = Math.max(sum[3], FADES);
     const x = shifts[3 * v] + sum[0] / share, y = shifts[3 * v + 1] + sum[1] / share, z = shifts[3 * v + 2] + sum[2] / share;
@@ -215,6 +230,14 @@ function spreadShifts({ n, rings, part, reached, give, shifts, wanted, mean }) {
     shifts[3 * v] = scale * x;
     shifts[3 * v + 1] = scale * y;
     shifts[3 * v + 2] = scale * z;
+  }
+}
+
+// 1 for vertices with one around them that wants a shift.
+function markAround({ start, index }, wanted, n, marks) {
+  marks.fill(0);
+  for (let v = 0; v < n; v++) {
+    if (wanted[4 * v + 3]) for (let e = start[v]; e < start[v + 1]; e++) marks[index[e]] = 1;
   }
 }
 
