@@ -15,10 +15,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.adaptation.adapt import Adaptation, adapt, add_detail
+from oasis_warp.adaptation.fine_skin import COARSE, SPACING, cut_skin
 from oasis_warp.adaptation.photo_view import match_photos
 from oasis_warp.adaptation.rim_shade import limit_shade, match_rim
 from oasis_warp.adaptation.smooth_shade import spread_shade
-from oasis_warp.adaptation.unseen_skin import COARSE, SPACING, OwnSkin, PaintedSkin, paint_unseen
+from oasis_warp.adaptation.unseen_skin import OwnSkin, PaintedSkin, paint_unseen
 from oasis_warp.avatar.densify import coarsen
 from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.avatar.prior import Prior
@@ -301,9 +302,8 @@ def _finish(
     if config.unseen == "painted":
         with stage("painting"):
             spacing = COARSE if config.size != "auto" and config.size <= COARSE_SIZE else SPACING
-            painted = paint_unseen(
-                hand, gaussians, adaptation.guess, first, adaptation.trusted, seed=config.seed, spacing=spacing
-            )
+            gaussians = cut_skin(hand, gaussians, close, spacing)
+            painted = paint_unseen(hand, gaussians, adaptation.guess, first, adaptation.trusted, seed=config.seed)
             gaussians = painted.gaussians
     rest, lights = first.rest.vertices, adaptation.lights
     if lights is not None:
@@ -313,7 +313,7 @@ def _finish(
         lights = tuple(end_shade(hand, light, rest) for light in lights)
         with stage("detail"):
             gaussians = match_photos(hand, gaussians, close, lights, adaptation.gains)
-    closed = close_wrist(hand, gaussians, rest, min(spacing, ARM_STEP))
+    closed = close_wrist(hand, gaussians, rest, min(spacing, ARM_STEP), seed=config.seed)
     return adaptation._replace(gaussians=closed, lights=lights), painted
 
 

@@ -6,10 +6,11 @@ from synthetic import PALM_TO_CAMERA, crop_of
 
 from oasis_warp.adaptation import reliability, scraps
 from oasis_warp.adaptation.adapt import adapt
+from oasis_warp.adaptation.fine_skin import SPACING, cut_skin
 from oasis_warp.adaptation.reliability import mask_unreliable
 from oasis_warp.adaptation.skin_detail import sample_detail
 from oasis_warp.adaptation.skin_grain import skin_grain
-from oasis_warp.adaptation.unseen_skin import SEEN, SPACING, _clarities, paint_hand, paint_unseen
+from oasis_warp.adaptation.unseen_skin import SEEN, _clarities, paint_hand, paint_unseen
 from oasis_warp.avatar.anchors import RIM_FADE, vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.densify import coarsen
@@ -30,9 +31,8 @@ def palm_photo(hand):
 
 def paint(hand, palm_photo, gaussians=None, seed=0, observations=None):
     crop, adapted = palm_photo
-    return paint_unseen(
-        hand, gaussians or adapted.gaussians, adapted.guess, crop, observations or adapted.observations, seed=seed
-    )
+    fine = cut_skin(hand, gaussians or adapted.gaussians, [crop])
+    return paint_unseen(hand, fine, adapted.guess, crop, observations or adapted.observations, seed=seed)
 
 
 @pytest.fixture(scope="module")

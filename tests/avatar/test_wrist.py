@@ -75,8 +75,8 @@ def test_the_end_is_opaque_and_has_the_colour_of_the_skin_before_it(hand, hands)
     skin = end(after)
     skin[arm_of(hand, rest, after)] = False
     assert after.opacities[skin].min() > 0.9 and before.opacities[end(before)].median() < 0.5
-    apart = (after.colors[end(after)] - SKIN).abs()
-    assert apart.median() < 1e-3 and apart.max() < 0.06  # the detail of the edge to the palm comes along
+    logs = (after.colors[end(after)] / SKIN).log()
+    assert logs.mean(0).abs().max() < 0.03 and 0.01 < logs.std() < 0.04 and logs.abs().max() < 0.15  # its own pattern
 
 
 def test_the_detail_of_the_end_is_no_louder_than_skin(hand, hands):
@@ -94,10 +94,12 @@ def test_the_detail_of_the_end_is_no_louder_than_skin(hand, hands):
 
 
 def test_the_arms_detail_varies_along_it(hand, hands):
-    """Past the 5 cm of skin that it repeats, one row of skin went on to the end: streaks along the arm."""
+    """It repeated the hand's skin in the mirror, which looked like grain of wood, and once one row of it: streaks."""
     rest, before, _ = hands
     noise = 0.1 * torch.randn(len(before.colors), 1, generator=torch.Generator().manual_seed(0))
-    after = close_wrist(hand, before._replace(colors=(before.colors * noise.exp()).clamp(max=1)), rest)
+    rough = before._replace(colors=(before.colors * noise.exp()).clamp(max=1))
+    after, other = (close_wrist(hand, rough, rest, seed=seed) for seed in (0, 1))
+    assert not torch.equal(after.colors, other.colors)
     axis, arm = rim_axis(rest, hand.rim), arm_of(hand, rest, after)
     at = centers(hand, rest, after)[arm] - rest[hand.rim].mean(0)
     height, logs = at @ axis, after.colors[arm].log().mean(1)

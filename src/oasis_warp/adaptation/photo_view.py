@@ -1,4 +1,4 @@
-"""The photos' own views as the photos show them, by the shade that fades everywhere else."""
+"""What the photos' cameras see: kept as Gaussians change, or changed into the photos by shade that fades elsewhere."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,12 +9,13 @@ from torch import Tensor
 
 from oasis_warp.adaptation.sharpen import lit_as_photo
 from oasis_warp.avatar.anchors import rim_fade, vertex_to_gaussians
+from oasis_warp.avatar.densify import Densified
 from oasis_warp.avatar.observation import faded_in
-from oasis_warp.avatar.pose import pose_gaussians, posed_lighting
+from oasis_warp.avatar.pose import pose_gaussians, posed_lighting, with_shade_baked
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandLight
 from oasis_warp.ops import BlendWeights, blend_colors
-from oasis_warp.render import view_weights
+from oasis_warp.render import render, view_weights
 
 ROUNDS, OVERSHOOT = 8, 1.5
 """Steps towards the photo, and how much longer each is than the mean of what is missing."""
@@ -26,20 +27,22 @@ FEWEST = 0.05
 """Least sum of a Gaussian's weights over the pixels that count: less says nothing about its colour."""
 MIN_COLOR = 0.01
 """Least colour whose logarithm is taken."""
+MIN_ALPHA = 0.05
+"""Below it a pixel says nothing about the colour of the hand."""
 MOST = 3.0
-"""Largest logarithm by which shade changes."""
+"""Largest logarithm by which colours change."""
 
 
 class _View(NamedTuple):
-    """A photo's view before its match."""
+    """A camera's picture that Gaussians are to show."""
 
     weights: BlendWeights
     colors: Float[Tensor, "N 3"]
-    """Of the Gaussians, in the photo's light."""
+    """Of the Gaussians before, in the picture's light."""
+    goal: Float[Tensor, "H W 3"]
+    """The picture, as far as the Gaussians cover it."""
     counts: Float[Tensor, "H W 1"]
     """How much each pixel counts."""
-    total: Float[Tensor, "N 1"]
-    """Sum of each Gaussian's weights over these pixels."""
 
 
 @torch.no_grad()
@@ -53,10 +56,8 @@ def match_photos(
     """Change the shade of Gaussians until their pictures are the photos.
 
     Where the photo may show something else than the fitted skin, that skin keeps its own colours; in the photo's own
-    view these were cracks and double contours beside fingers. Each step moves the colour of a Gaussian, as the photo
-    shows it, by the mean of what its pixels miss, weighted as they blend it (SIRT, Gilbert 1972). Several photos share
-    a Gaussian as the squares of the weights that it has in each: nearly all of it goes to the one that shows it best.
-    All of it is shade, which goes as the hand or the camera moves.
+    view these were cracks and double contours beside fingers. All of the change is shade, which goes as the hand or the
+    camera moves.
 
     Args:
         hand: Model of the surface.
@@ -67,32 +68,60 @@ def match_photos(
     """
     if gaussians.shade is None:
         return gaussians
-    rest, faces = crops[0].rest.vertices, hand.faces.to(crops[0].image.device)
-    views = [_view(gaussians, faces, *each) for each in zip(crops, lights, gains, strict=True)]
-    squares = torch.stack([view.total.square() for view in views])
-    shares = squares / squares.sum(0).clamp_min(FEWEST**2)
-    logs = sum(_missing(view, crop, share) for view, crop, share in zip(views, crops, shares, strict=True))
+    rest, faces, views = crops[0].rest.vertices, hand.faces.to(crops[0].image.device), []
+    for crop, light, gain in zip(crops, lights, gains, strict=True):
+        posed = crop.posed.vertices
+        lit = lit_as_photo(gaussians, faces, light, posed_lighting(rest, posed, faces, light))
+        weights = view_weights(pose_gaussians(lit, faces, rest, posed), crop.camera)
+        goal, counts = crop.image * weights.alphas, faded_in(crop.mask, BORDER)[..., None]
+        views.append(_View(weights, (lit.colors * gain).clamp(0, 1), goal, counts))
     fade = rim_fade(rest[None], hand.rim.to(rest.device), WRIST, WRIST)[0, :, None]
-    return gaussians._replace(shade=gaussians.shade * (logs * vertex_to_gaussians(fade, faces, gaussians)).exp())
+    logs = _missing(views) * vertex_to_gaussians(fade, faces, gaussians)
+    return gaussians._replace(shade=gaussians.shade * logs.exp())
 
 
-def _view(
-    gaussians: CanonicalGaussians, faces: Tensor, crop: HandCrop, light: HandLight, gain: Float[Tensor, "3"]
-) -> _View:
-    rest, posed = crop.rest.vertices, crop.posed.vertices
-    lit = lit_as_photo(gaussians, faces, light, posed_lighting(rest, posed, faces, light))
-    colors = (lit.colors * gain).clamp(0, 1)
-    weights = view_weights(pose_gaussians(lit, faces, rest, posed), crop.camera)
-    counts = faded_in(crop.mask, BORDER)[..., None]
-    return _View(weights, colors, counts, weights.transpose @ counts.view(-1, 1))
+@torch.no_grad()
+def keep_pictures(
+    hand: HandModel, before: CanonicalGaussians, after: Densified, crops: Sequence[HandCrop]
+) -> CanonicalGaussians:
+    """The finer Gaussians `after`, with the new ones in such colours that photos' cameras see what they saw `before`.
+
+    Fine Gaussians have the averages of those that were there, which blurs what the photos show.
+
+    Args:
+        hand: Model of the surface.
+        before: Fitted to the photos.
+        after: The same with finer ones.
+        crops: K photos, with one surface at rest.
+    """
+    faces, views, made = hand.faces.to(crops[0].image.device), [], after.gaussians
+    old, new = with_shade_baked(before), with_shade_baked(made)
+    for crop in crops:
+        surfaces = faces, crop.rest.vertices, crop.posed.vertices
+        image, alpha = render(pose_gaussians(old, *surfaces), crop.camera)
+        weights, alpha = view_weights(pose_gaussians(new, *surfaces), crop.camera), alpha[..., None]
+        goal = image / alpha.clamp_min(MIN_ALPHA) * weights.alphas
+        views.append(_View(weights, new.colors, goal, (alpha > MIN_ALPHA).to(alpha)))
+    logs = _missing(views)
+    logs[: len(logs) - after.n_new] = 0
+    return made._replace(colors=(made.colors * logs.exp()).clamp(0, 1))
 
 
-def _missing(view: _View, crop: HandCrop, share: Float[Tensor, "N 1"]) -> Float[Tensor, "N 3"]:
-    """What the logarithms of the Gaussians' colours miss in a photo, as far as that photo's `share` goes."""
-    weights, start, counts, total = view
-    goal, colors, share = crop.image * weights.alphas, start, share * (total > FEWEST)
-    for _ in range(ROUNDS):
-        missing = (goal - blend_colors(weights, colors)) * counts
-        step = (weights.transpose @ missing.view(-1, 3)) / total.clamp_min(FEWEST)
-        colors = (colors + OVERSHOOT * step * share).clamp(0, 1)
-    return (colors.clamp_min(MIN_COLOR) / start.clamp_min(MIN_COLOR)).log().clamp(-MOST, MOST)
+def _missing(views: Sequence[_View]) -> Float[Tensor, "N 3"]:
+    """What the logarithms of the Gaussians' colours miss in pictures.
+
+    Each step moves the colour of a Gaussian, as a picture shows it, by the mean of what its pixels miss, weighted as
+    they blend it (SIRT, Gilbert 1972). Several pictures share a Gaussian as the squares of the weights that it has in
+    each: nearly all of it goes to the one that shows it best, so they do not undo each other's change.
+    """
+    totals = torch.stack([view.weights.transpose @ view.counts.view(-1, 1) for view in views])
+    shares = totals.square() / totals.square().sum(0).clamp_min(FEWEST**2) * (totals > FEWEST)
+    logs = torch.zeros_like(views[0].colors)
+    for (weights, start, goal, counts), total, share in zip(views, totals, shares, strict=True):
+        colors = start
+        for _ in range(ROUNDS):
+            missing = (goal - blend_colors(weights, colors)) * counts
+            step = (weights.transpose @ missing.view(-1, 3)) / total.clamp_min(FEWEST)
+            colors = (colors + OVERSHOOT * step * share).clamp(0, 1)
+        logs += (colors.clamp_min(MIN_COLOR) / start.clamp_min(MIN_COLOR)).log().clamp(-MOST, MOST)
+    return logs

@@ -3,10 +3,11 @@
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from oasis_warp.adaptation.fine_skin import SPACING
 from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.adaptation.reliability import VertexObservations
 from oasis_warp.adaptation.skin_detail import SkinDetail, flush_shade, relief_shade, sample_detail
@@ -29,9 +30,6 @@ JOIN_DETAIL, JOIN_REACH = 0.004, 0.04
 the person's mean colours [m]."""
 MAX_DIFFERENT = 0.3
 """Difference of the logarithms from the person's mean colours that is carried on: more is dirt, a ring or a shadow."""
-SPACING, COARSE = 0.55e-3, 2e-3
-"""Side of the squares that are as large as the parts of faces are at most [m]: 2 to 3 px of a fist that fills 512 px.
-And the same where pictures of 256 px of an open hand are all that is wanted: faces stay whole."""
 SHOWS_FORM = 0.3
 """Cosine between normal and view from which a photo shows the forms of skin that it shows on a slant."""
 ON_PALM, ON_BACK = 1.6, 1.25
@@ -92,7 +90,6 @@ def paint_unseen(
     observations: VertexObservations,
     *,
     seed: int,
-    spacing: float = SPACING,
 ) -> PaintedSkin:
     """Replace the colours of what was not seen.
 
@@ -100,17 +97,15 @@ def paint_unseen(
     membrane x continues the difference of the seen skin from it (`inpaint`). The detail d comes from real hands
     (`sample_detail`), with the skin's relief (`relief_shade`), blotches of blood (`flush_shade`) and grain
     (`skin_grain`). Where the seen skin ends, t + x is its own smooth colour, so that gradients continue and no seam
-    shows. Faces with one Gaussian are cut into finer ones everywhere: in a fist that fills the picture, skin that is as
-    coarse as that of an open hand looks like wax. Seen skin gets grain, which its shade removes in the photo.
+    shows. Seen skin gets grain, which its shade removes in the photo.
 
     Args:
         hand: Model of the surface.
-        gaussians: Fitted to the photos, in even light.
+        gaussians: Fitted to the photos, in even light, and as fine as the skin is to be (`cut_skin`).
         guess: Guess of the prior, before adaptation.
         crop: The first photo.
         observations: What the photos show, as far as it is skin: `Adaptation.trusted`.
         seed: Seed of the detail.
-        spacing: Side of the squares that are as large as the parts of faces are at most [m].
     """
     rest = crop.rest.vertices
     faces = hand.faces.to(rest.device)
@@ -127,15 +122,14 @@ def paint_unseen(
     smooth = inpaint(rest, faces, difference, sure, detail=JOIN_DETAIL, fade=JOIN_REACH)
     bed = _nail_color(tone, seen, confidence * nail, nail.sum())
 
-    fine = densify(gaussians, rest, faces, _parts(gaussians, rest, faces, spacing), SKIN).gaussians
     unknown = (1 - first.visibility * first.facing / SHOWS_FORM).clamp(0, 1)
     skin = OwnSkin(tone, *_clarities(hand, observations))
     form = _skin_form(hand, rest, seed) * unknown[:, None]
     painted, grain = _paint_on(
-        hand, fine, rest, tone.log_skin + form + smooth, bed + smooth + _nail_form(hand, rest), skin, seed
+        hand, gaussians, rest, tone.log_skin + form + smooth, bed + smooth + _nail_form(hand, rest), skin, seed
     )
-    shares = vertex_to_gaussians(torch.stack([invented, shown], 1), faces, fine).clamp(0, 1)
-    return PaintedSkin(_mix(fine, painted, grain, *shares.split(1, 1)), invented, skin)
+    shares = vertex_to_gaussians(torch.stack([invented, shown], 1), faces, gaussians).clamp(0, 1)
+    return PaintedSkin(_mix(gaussians, painted, grain, *shares.split(1, 1)), invented, skin)
 
 
 @torch.no_grad()
@@ -152,7 +146,7 @@ def paint_hand(
         seed: Seed of the detail.
     """
     faces = hand.faces.to(rest.device)
-    fine = densify(guess, rest, faces, _parts(guess, rest, faces, SPACING), SKIN).gaussians
+    fine = densify(guess, rest, faces, parts_for_spacing(rest, faces, SPACING), SKIN).gaussians
     nails = skin.tone.log_nail + _nail_form(hand, rest)
     painted, _ = _paint_on(hand, fine, rest, skin.tone.log_skin + _skin_form(hand, rest, seed), nails, skin, seed)
     return fine._replace(colors=painted.exp().clamp(MIN_COLOR, 1), shade=None)
@@ -223,14 +217,6 @@ def _nail_color(tone: SkinTone, seen: Tensor, weight: Float[Tensor, "V"], total:
     known = weight.sum() / total
     own = (weight[:, None] * seen.clamp_min(MIN_COLOR).log()).sum(0) / weight.sum().clamp_min(1e-9)
     return torch.lerp(tone.log_nail, own, known / (known + KNOWN_NAIL))
-
-
-def _parts(
-    gaussians: CanonicalGaussians, rest: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], spacing: float
-) -> Int[Tensor, "F"]:
-    """Parts an edge of the faces that have one Gaussian; those that show a photo's detail have more."""
-    n_own = torch.bincount(gaussians.face_index, minlength=len(faces))
-    return torch.where(n_own == 1, parts_for_spacing(rest, faces, spacing), 1)
 
 
 def _skin_detail(detail: SkinDetail, palm: Float[Tensor, "N 1"] | float) -> Float[Tensor, "N 3"]:

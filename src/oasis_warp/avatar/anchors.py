@@ -118,6 +118,14 @@ def rim_fade(
     return fade * fade * (3 - 2 * fade)
 
 
+def centers_at_rest(
+    gaussians: CanonicalGaussians, rest: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
+) -> Float[Tensor, "N 3"]:
+    """Where Gaussians lie on the surface at rest [m]."""
+    on_faces = (rest[faces[gaussians.face_index]] * gaussians.barycentrics[..., None]).sum(1)
+    return torch.cat([rest[gaussians.vertex_index] + gaussians.offsets, on_faces])
+
+
 def vertex_shapes(
     vertices: Float[Tensor, "*B V 3"], faces: Int[Tensor, "F 3"], vertex_faces: Int[Tensor, "V M"]
 ) -> tuple[Float[Tensor, "*B V 4"], Float[Tensor, "*B V 3"]]:

@@ -9,7 +9,15 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from oasis_warp.avatar.anchors import FACE_SPREAD, MIN_OPACITY, OPACITY, face_shapes, place_anchors, vertex_shapes
+from oasis_warp.avatar.anchors import (
+    FACE_SPREAD,
+    MIN_OPACITY,
+    OPACITY,
+    centers_at_rest,
+    face_shapes,
+    place_anchors,
+    vertex_shapes,
+)
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.processes import kernel_threads
@@ -195,9 +203,7 @@ def read_at(
     points: Float[Tensor, "M 3"],
 ) -> Float[Tensor, "M D"]:
     """Values of the nearest Gaussians at `points` of the surface at rest [m], each weighted by what it covers there."""
-    on_vertices = vertices[gaussians.vertex_index] + gaussians.offsets
-    on_faces = (vertices[faces[gaussians.face_index]] * gaussians.barycentrics[..., None]).sum(1)
-    centers = torch.cat([on_vertices, on_faces])
+    centers = centers_at_rest(gaussians, vertices, faces)
     tree = cKDTree(centers.detach().cpu().double().numpy())
     count = min(NEIGHBOURS, len(centers))
     _, near = tree.query(points.detach().cpu().double().numpy(), count, workers=kernel_threads())

@@ -311,8 +311,9 @@ def pose_gaussians(
 ) -> Gaussians:
     """Gaussians that follow the surface from `rest_vertices` to `posed_vertices` (the paper's appendix B.1).
 
-    Face Gaussians keep their barycentrics, rotate by the blended rotation of the face's corners and scale with the root
-    of the face's area. Vertex Gaussians rotate with their vertex and scale with the faces around it together. Values
+    Face Gaussians keep their barycentrics, rotate by the blended rotation of the face's corners and grow with the root
+    of the face's area. Vertex Gaussians rotate with their vertex and grow with the faces around it together. None gets
+    smaller: skin is pressed together in one direction, and in the other gaps would open. Values
     are not checked here: the caller has checked the pose. A surface that is posed many times is given as its
     `rest_mesh`. If `posed_vertices` have a leading axis of poses, so have means, quats and scales. With a `light`, so
     have the colours: they are drawn in it, without the part that the posed surface hides. With the `center` of a
@@ -324,6 +325,7 @@ def pose_gaussians(
         rest_vertices, posed_vertices, faces, canonical.face_index, canonical.barycentrics, canonical.vertex_index,
         canonical.offsets, canonical.quats, canonical.scales, with_vertex_quats=light is not None,
     )  # fmt: skip
+    scales = torch.maximum(scales, canonical.scales)
     colors = canonical.colors
     if light is not None and vertex_quats is not None:
         on = lighting(posed_vertices, vertex_quats, light.normals, light.light, closeness)

@@ -4,7 +4,6 @@ import math
 
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -14,10 +13,12 @@ from oasis_warp.avatar.anchors import (
     THICKNESS,
     VERTEX_SPREAD,
     batch_anchors,
+    centers_at_rest,
     rim_fade,
     surface_frames,
     vertex_to_gaussians,
 )
+from oasis_warp.avatar.arm_skin import arm_colors
 from oasis_warp.avatar.densify import GROUND_DEPTH, SKIN, cut_faces, ground_discs, parts_for_spacing
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
@@ -28,22 +29,10 @@ END, OVERLAP = 0.5, 0.8
 SHADE_FADE = 0.022
 """The stretch before that fade over which the photo's shade ends [m]: that of a sleeve, or of the turn into the arm,
 looks like a burn where the arm is missing."""
-SMOOTHING = 0.004
-"""Standard deviation of the average of colours from before the fade [m]: photos show sleeves and shadows there."""
-MIRRORED = 0.05
-"""The stretch of skin before the rim whose detail the end of the wrist repeats in the mirror [m]."""
-REPEATED = MIRRORED - RIM_FADE
-"""The stretch after which the mirror turns again [m]: past it the skin's last row would go on as streaks."""
-AVERAGED = 100
-"""Number of nearest places of that skin, 6 mm around; detail is the difference of one from their mean. With 32 the
-blotches of a back ended at the rim."""
-PLACES = 4000
-"""About as many places of fine skin count for these means, as many as coarse skin has."""
+LEFT = 0.5
+"""Share of the photo's shade that is left where the hand's own colours end to turn into those of the arm."""
 DARKEST = 0.02
-"""Colours are clamped to it before their logarithm is taken [sRGB]."""
-CONTRAST = 0.045
-"""Largest standard deviation of that detail's logarithm, what palms have from one to four pixels of 256: more is the
-edge of a shadow or of a sleeve."""
+"""Colours are clamped to it before they are mixed [sRGB]."""
 ARM_LENGTH = 0.12
 """The stretch past the rim over which an arm fades out [m]: a hand that ends at once looks sawn off, and one whose arm
 fades within the picture, as 6 cm did beside a thumb that points up, looks cut out."""
@@ -72,19 +61,21 @@ WALL_SPREAD = 1.3
 
 
 def close_wrist(
-    hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tensor, "V 3"], spacing: float = ARM_STEP
-) -> CanonicalGaussians:
+    hand: HandModel, gaussians: CanonicalGaussians, rest: Float[Tensor, "V 3"], spacing: float = ARM_STEP,
+    *, seed: int = 0,
+) -> CanonicalGaussians:  # fmt: skip
     """Close the hand at the wrist, where a prior's opacity fades out because photos show an arm there.
 
     Gaussians in the second half of the fade are replaced by opaque ones on parts of faces, over discs at the vertices;
     the others become as opaque as they were before the fade. The Gaussians of the arm are bound to rim vertices. New
-    Gaussians continue the colours of those before the fade, without shade; the shade of the others ends before.
+    Gaussians have the colours of `arm_colors`, without shade; the colours and the shade of the others end before.
 
     Args:
         hand: Model of the surface.
         gaussians: On `rest`.
         rest: The surface at rest [m].
         spacing: Distance of the new Gaussians at the rim [m].
+        seed: Of the arm's skin.
     """
     faces, rim = hand.faces.to(rest.device), hand.rim.to(rest.device)
     full = batch_anchors(rest[None], faces, surface.faces_of_vertices(faces, len(rest)), rim)
@@ -104,9 +95,14 @@ def close_wrist(
     points = torch.cat([rest[vertices], rest[index] + offsets])
     on_parts = (rest[faces[on_faces]] * places[..., None]).sum(1)
     left = vertex_to_gaussians(shade_left(hand, rest), faces, kept)
-    kept = kept._replace(colors=_calmed(kept, rest, faces, (2 * left).clamp(max=1)))
-    read = _continued(gaussians, own, rest, faces, rim, torch.cat([points, on_parts]))
-    read = read.split([len(points), len(on_faces)])
+    near = torch.nonzero(left[:, 0] < LEFT)[:, 0]
+    wanted = torch.cat([points, on_parts, centers_at_rest(kept, rest, faces)[near]])
+    known = (own >= 1) & (torch.cdist(centers_at_rest(gaussians, rest, faces), rest[rim]).amin(1) < 2 * RIM_FADE)
+    *read, calm = arm_colors(select(gaussians, known), rest, faces, rim, rim_axis(rest, rim), wanted, seed).split(
+        [len(points), len(on_faces), len(near)]
+    )
+    mixed = calm * (kept.colors[near].clamp_min(DARKEST) / calm) ** (left[near] / LEFT)
+    kept = kept._replace(colors=kept.colors.index_copy(0, near, mixed))
 
     opaque = rest.new_full((len(points) + len(on_faces) - len(arm_opacities),), OPACITY)
     on_points, of_faces = opaque.split([len(points) - len(arm_opacities), len(on_faces)])
@@ -138,79 +134,6 @@ def end_shade(hand: HandModel, light: HandLight, rest: Float[Tensor, "V 3"]) -> 
 def shade_left(hand: HandModel, rest: Tensor) -> Float[Tensor, "V 1"]:
     """The power of the photo's shade that is left at each vertex: 0 at the wrist's end, 1 before `SHADE_FADE`."""
     return rim_fade(rest[None], hand.rim.to(rest.device), RIM_FADE, SHADE_FADE)[0, :, None]
-
-
-def _centers(gaussians: CanonicalGaussians, rest: Tensor, faces: Tensor) -> Float[Tensor, "N 3"]:
-    on_faces = (rest[faces[gaussians.face_index]] * gaussians.barycentrics[..., None]).sum(1)
-    return torch.cat([rest[gaussians.vertex_index] + gaussians.offsets, on_faces])
-
-
-def _average(logs: Float[Tensor, "N 3"], places: Tensor, at: Float[Tensor, "M 3"]) -> tuple[Tensor, Tensor]:
-    """Mean of the skin's logarithms around each point, and the share of its detail that has no more than `CONTRAST`."""
-    some = _thinned(torch.arange(len(places), device=places.device))
-    around = logs[some][_nearest(at, places[some], AVERAGED)]
-    average = around.mean(1)
-    contrast = (around - average[:, None]).square().mean((1, 2)).sqrt()
-    return average, (CONTRAST / contrast.clamp_min(CONTRAST))[:, None]
-
-
-def _thinned(index: Int[Tensor, "N"]) -> Int[Tensor, "M"]:
-    """Every k-th, `PLACES` or so."""
-    return index[:: max(1, round(len(index) / PLACES))]
-
-
-def _calmed(gaussians: CanonicalGaussians, rest: Tensor, faces: Tensor, left: Float[Tensor, "N 1"]) -> Tensor:
-    """Colours whose detail before the end is as quiet as that of the arm; `left` is 1 where they stay."""
-    near = torch.nonzero(left[:, 0] < 1)[:, 0]
-    logs, centers = gaussians.colors[near].clamp_min(DARKEST).log(), _centers(gaussians, rest, faces)[near]
-    average, quiet = _average(logs, centers, centers)
-    calm = average + torch.lerp(quiet, torch.ones_like(quiet), left[near]) * (logs - average)
-    return gaussians.colors.index_copy(0, near, calm.exp().clamp(max=1))
-
-
-def _continued(
-    gaussians: CanonicalGaussians, fade: Tensor, rest: Tensor, faces: Tensor, rim: Tensor, points: Tensor
-) -> Float[Tensor, "M 3"]:
-    """Colours at `points` past where the fade begins: smooth ones from just before it, with detail of skin.
-
-    They are averages, and wider where the skin is farther away. With one width the middle of the arm would have wedges
-    of one colour each. Detail is the difference of the skin as far before that place, in the same direction from the
-    wrist's axis, from its own averages; towards the middle of the arm, where all directions meet, it ends.
-    """
-    centers = _centers(gaussians, rest, faces)
-    far = torch.cdist(centers, rest[rim]).amin(1)
-    skin = (fade >= 1) & (far < MIRRORED)
-    start = _thinned(torch.nonzero(skin & (far < 2 * RIM_FADE))[:, 0])
-    near = torch.cdist(points, centers[start]).square()
-    spread = SMOOTHING**2 + near.amin(1, keepdim=True)
-    mean = torch.softmax(-0.5 * near / spread, 1) @ gaussians.colors[start]
-    axis, middle = rim_axis(rest, rim), rest[rim].mean(0)
-    radius = (rest[rim] - middle).norm(dim=1).mean()
-    if len(gaussians.face_index):  # vertices lie below the faces, and have less detail
-        skin[: len(gaussians.vertex_index)] = False
-
-    def unrolled(at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Directions from the axis, distance from it and place along it; skin before the fade is above 0."""
-        arm = at - middle
-        along = arm @ axis
-        arm = arm - along[:, None] * axis
-        return radius * normalize(arm, dim=1), arm.norm(dim=1), -along - RIM_FADE
-
-    (aside, out, past), (skin_aside, _, before) = unrolled(points), unrolled(centers[skin])
-    past = (radius - out).clamp_min(0) - past
-    past = REPEATED - ((past.clamp_min(0) % (2 * REPEATED)) - REPEATED).abs()
-    keys = torch.cat([aside, past[:, None]], 1), torch.cat([skin_aside, before[:, None]], 1)
-    source = _nearest(*keys, 1)[:, 0]
-    logs, places = gaussians.colors[skin].clamp_min(DARKEST).log(), centers[skin]
-    average, quiet = _average(logs, places, places[source])
-    quiet = quiet * (2 * out / radius).clamp(max=1)[:, None]
-    detail = (logs[source] - average).clamp(-3 * CONTRAST, 3 * CONTRAST) * quiet
-    return (mean * detail.exp()).clamp(max=1)
-
-
-def _nearest(points: Float[Tensor, "M D"], among: Float[Tensor, "N D"], count: int) -> Int[Tensor, "M K"]:
-    found = cKDTree(among.detach().cpu().numpy()).query(points.detach().cpu().numpy(), min(count, len(among)))[1]
-    return torch.from_numpy(found.reshape(len(points), -1)).to(points.device)
 
 
 def rim_axis(rest: Float[Tensor, "V 3"], rim: Int[Tensor, "R"]) -> Float[Tensor, "3"]:

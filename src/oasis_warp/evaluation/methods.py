@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 
 from oasis_warp.adaptation.adapt import adapt
+from oasis_warp.adaptation.fine_skin import cut_skin
 from oasis_warp.adaptation.prior_guess import calibrate
 from oasis_warp.adaptation.unlit import view_in_photo
 from oasis_warp.adaptation.unseen_skin import paint_unseen
@@ -130,5 +131,6 @@ def reconstructions(
             if ONE_SHOT in stages:
                 yield Method(name, ONE_SHOT), LitGaussians(adapted.gaussians, adapted.light)
             if PAINTED in stages:
-                painted = paint_unseen(hand, adapted.gaussians, adapted.guess, crop, adapted.trusted, seed=config.seed)
+                fine = cut_skin(hand, adapted.gaussians, [crop])
+                painted = paint_unseen(hand, fine, adapted.guess, crop, adapted.trusted, seed=config.seed)
                 yield Method(name, PAINTED), LitGaussians(painted.gaussians, adapted.light)

@@ -67,7 +67,7 @@ function poseGaussians(body, gaussians) {
       w *= norm, x *= norm, y *= norm, z *= norm;
       grown = faceGrowth[faceIndex[i - nOnVertices]];
     }
-    const factor = Math.min(Math.max(grown, 1 / MAX_GROWTH), MAX_GROWTH); // scales grow with the root of the area
+    const factor = Math.min(Math.max(grown, 1), MAX_GROWTH); // scales grow with the root of the area, and do not shrink
     const a = quats[4 * i], b = quats[4 * i + 1], c = quats[4 * i + 2], d = quats[4 * i + 3];
     writeCovariance(
       w * a - x * b - y * c - z * d, w * b + x * a + y * d - z * c, w * c - x * d + y * a + z * b,
