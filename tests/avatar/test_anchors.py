@@ -200,6 +200,16 @@ def test_offsets_turn_with_the_surface(hand):
     torch.testing.assert_close(posed.means[:n], expected, atol=1e-6, rtol=0)
 
 
+def test_gaussians_grow_with_the_surface_and_do_not_shrink(hand):
+    """Skin is pressed together in one direction: in the palm of a fist gaps opened in the other, as light lines."""
+    canonical, rest = canonical_and_rest(hand)
+    small, large = (
+        pose_gaussians(canonical, hand.faces, rest.vertices, size * rest.vertices).scales for size in (0.5, 2)
+    )
+    assert torch.equal(small, canonical.scales)
+    torch.testing.assert_close(large, 2 * canonical.scales)
+
+
 def test_the_mirrored_gaussians_on_the_mirrored_surface_are_the_mirror_image(hand):
     canonical, rest = canonical_and_rest(hand)
     generator = torch.Generator().manual_seed(0)
