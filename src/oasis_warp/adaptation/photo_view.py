@@ -27,6 +27,8 @@ FEWEST = 0.05
 """Least sum of a Gaussian's weights over the pixels that count: less says nothing about its colour."""
 MIN_COLOR = 0.01
 """Least colour whose logarithm is taken."""
+HARDLY_SEEN = 1.0
+"""The same of Gaussians that keep a picture: those at the borders of what is seen became scales."""
 MIN_ALPHA = 0.05
 """Below it a pixel says nothing about the colour of the hand."""
 MOST, MOST_KEPT = 3.0, 0.3
@@ -77,7 +79,7 @@ def match_photos(
         goal, counts = crop.image * weights.alphas, faded_in(crop.mask, BORDER)[..., None]
         views.append(_View(weights, (lit.colors * gain).clamp(0, 1), goal, counts))
     fade = rim_fade(rest[None], hand.rim.to(rest.device), WRIST, WRIST)[0, :, None]
-    logs = _missing(views) * vertex_to_gaussians(fade, faces, gaussians)
+    logs = _missing(views, FEWEST) * vertex_to_gaussians(fade, faces, gaussians)
     return gaussians._replace(shade=gaussians.shade * logs.exp())
 
 
@@ -103,13 +105,13 @@ def keep_pictures(
         weights, alpha = view_weights(pose_gaussians(new, *surfaces), crop.camera), alpha[..., None]
         goal = image / alpha.clamp_min(MIN_ALPHA) * weights.alphas
         views.append(_View(weights, new.colors, goal, (alpha > MIN_ALPHA).to(alpha)))
-    logs = _missing(views).clamp(-MOST_KEPT, MOST_KEPT)
+    logs = _missing(views, HARDLY_SEEN).clamp(-MOST_KEPT, MOST_KEPT)
     logs[: len(logs) - after.n_new] = 0
     return made._replace(colors=(made.colors * logs.exp()).clamp(0, 1))
 
 
-def _missing(views: Sequence[_View]) -> Float[Tensor, "N 3"]:
-    """What the logarithms of the Gaussians' colours miss in pictures.
+def _missing(views: Sequence[_View], least: float) -> Float[Tensor, "N 3"]:
+    """What the logarithms of the Gaussians' colours miss in pictures; little if their weights sum to less than `least`.
 
     Each step moves the colour of a Gaussian, as a picture shows it, by the mean of what its pixels miss, weighted as
     they blend it (SIRT, Gilbert 1972). Several pictures share a Gaussian as the squares of the weights that it has in
@@ -122,7 +124,7 @@ def _missing(views: Sequence[_View]) -> Float[Tensor, "N 3"]:
         colors = start
         for _ in range(ROUNDS):
             missing = (goal - blend_colors(weights, colors)) * counts
-            step = (weights.transpose @ missing.view(-1, 3)) / total.clamp_min(FEWEST)
+            step = (weights.transpose @ missing.view(-1, 3)) / total.clamp_min(least)
             colors = (colors + OVERSHOOT * step * share).clamp(0, 1)
         logs += (colors.clamp_min(MIN_COLOR) / start.clamp_min(MIN_COLOR)).log().clamp(-MOST, MOST)
     return logs

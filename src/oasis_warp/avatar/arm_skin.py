@@ -9,61 +9,128 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from oasis_warp.avatar.anchors import centers_at_rest
+from oasis_warp.avatar.anchors import RIM_FADE, centers_at_rest
+from oasis_warp.avatar.arm_lines import arm_lines
 from oasis_warp.avatar.cells import CELL, LONGER, TRIED, apart, blotches, furrows_and_tones
+from oasis_warp.core.processes import kernel_threads
 from oasis_warp.core.types import CanonicalGaussians
 
 SMOOTHING = 0.0015
 """Standard deviation of the average of the hand's colours, where they are nearest [m]."""
 PLACES = 4000
 """About as many places of the hand's skin count for that average."""
-BLOTCHES = (0.0011, 0.02), (0.0022, 0.03), (0.006, 0.025)
+BLOTCHES = (0.0011, 0.022), (0.0022, 0.018), (0.006, 0.014)
 """Least distances of the points that blotches are made of [m], and what they add to logarithms."""
 BLOOD = 0.7, 1.0, 1.0
 """Of a blotch, in red, green and blue."""
+OWN_ON_BACK = 0.4
+"""Strength of grain and blotches on the back's side, where detail of the hand is repeated."""
+MIRRORED = 0.05
+"""The stretch of skin before the rim whose detail the arm repeats in the mirror [m]."""
+REPEATED = MIRRORED - RIM_FADE
+"""The stretch after which the mirror turns again [m]: past it the skin's last row would go on as streaks."""
+AVERAGED = 100
+"""Number of nearest of `PLACES`, 6 mm around; detail is the difference of one from their mean."""
+BLENDED, APART = 6, 0.0004
+"""Places that detail is blended of, and the standard deviation of their weights [m]; the nearest alone is a mosaic."""
+CONTRAST = 0.045
+"""Largest standard deviation of that detail's logarithm, what palms have from one to four pixels of 256: more is the
+edge of a shadow or of a sleeve."""
+DARKEST = 0.02
+"""Colours are clamped to it before their logarithm is taken [sRGB]."""
 SPAN = -0.04, 0.125
 """The stretch along the arm that has a pattern, from the rim [m]."""
 
 
 def arm_colors(
     skin: CanonicalGaussians, rest: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], rim: Int[Tensor, "R"],
-    axis: Float[Tensor, "3"], points: Float[Tensor, "M 3"], seed: int,
+    axis: Float[Tensor, "3"], palm: Float[Tensor, "3"], points: Float[Tensor, "M 3"], seed: int,
 ) -> Float[Tensor, "M 3"]:  # fmt: skip
     """Colours at `points` of the arm.
 
     They are averages of the hand's skin, and wider where that is farther away: with one width the middle of the arm
-    would have wedges of one colour each. The pattern lies on a cylinder around the arm, and ends towards its axis.
-    Skin of the hand in the mirror looked like grain of wood.
+    would have wedges of one colour each. On them lies a pattern on a cylinder around the arm, which ends towards its
+    axis. On the palm's side it is all its own; towards the back more and more of it is the detail of the hand in the
+    mirror. That of palms, with their creases and shadows, looked like grain of wood.
 
     Args:
-        skin: Gaussians of the hand before the arm.
+        skin: Gaussians of the hand before the arm, those less than `MIRRORED` from the rim.
         rest: The surface at rest [m].
         faces: Its faces.
         rim: Vertices where it ends.
         axis: Direction of the arm.
+        palm: Direction into which the palm faces.
         points: Where colours are wanted [m].
         seed: Of the pattern.
     """
-    centers = centers_at_rest(skin, rest, faces)
-    thin = slice(None, None, max(1, round(len(centers) / PLACES)))
-    squared = torch.cdist(points, centers[thin]).square()
-    spread = SMOOTHING**2 + squared.amin(1, keepdim=True)
-    tone = torch.softmax(-0.5 * squared / spread, 1) @ skin.colors[thin]
-    arm = points - rest[rim].mean(0)
-    along = arm @ axis
-    arm, radius = arm - along[:, None] * axis, float((rest[rim] - rest[rim].mean(0)).norm(dim=1).mean())
-    across = normalize(torch.linalg.cross(axis, rest[rim[0]] - rest[rim].mean(0)), dim=0)
-    around = torch.atan2(arm @ torch.linalg.cross(axis, across), arm @ across)
-    pattern = _pattern(radius, around.cpu().double().numpy(), along.cpu().double().numpy(), seed)
-    outer = (2 * arm.norm(dim=1) / radius - 1).clamp(0, 1)[:, None]
+    centers, start = centers_at_rest(skin, rest, faces), rest[rim]
+    middle, radius = start.mean(0), float((start - start.mean(0)).norm(dim=1).mean())
+    first = normalize(palm - (palm @ axis) * axis, dim=0)
+    second = torch.linalg.cross(axis, first)
+
+    def unrolled(at: Tensor) -> tuple[np.ndarray, np.ndarray, Tensor]:
+        """Angle around the arm from the palm's side, place along it, and distance from its axis."""
+        along = (at - middle) @ axis
+        arm = at - middle - along[:, None] * axis
+        around = torch.atan2(arm @ second, arm @ first)
+        return around.cpu().double().numpy(), along.cpu().double().numpy(), arm.norm(dim=1)
+
+    around, along, out = unrolled(points)
+    back = ((1 - np.cos(around)) / 2)[:, None]
+    pattern = (1 - (1 - OWN_ON_BACK) * back) * _pattern(radius, around, along, seed)
+    pattern += arm_lines(radius, around, along, seed + 20)
+    on_faces = slice(len(skin.vertex_index) if len(skin.face_index) else 0, None)  # vertices have less detail
+    angles, places, _ = unrolled(centers[on_faces])
+    detail = _detail(skin.colors[on_faces], centers[on_faces])
+    sources = cKDTree(_on_cylinder(radius, angles, places))
+    pattern += back * _blended(detail, sources, _on_cylinder(radius, around, _mirrored(along)))
+    near = _thinned(torch.nonzero(torch.cdist(centers, start).amin(1) < 2 * RIM_FADE)[:, 0])
+    tone = _tone(skin.colors[near], centers[near], points)
+    outer = (2 * out / radius - 1).clamp(0, 1)[:, None]
     return (tone * (torch.from_numpy(pattern).to(tone) * outer).exp()).clamp(max=1)
 
 
-def _pattern(radius: float, around: np.ndarray, along: np.ndarray, seed: int) -> np.ndarray:
-    """What is added to the logarithms of colours at angles around the arm and places along it [m]."""
+def _tone(colors: Float[Tensor, "N 3"], centers: Float[Tensor, "N 3"], points: Tensor) -> Float[Tensor, "M 3"]:
+    squared = torch.cdist(points, centers).square()
+    spread = SMOOTHING**2 + squared.amin(1, keepdim=True)
+    return torch.softmax(-0.5 * squared / spread, 1) @ colors
 
-    def on_cylinder(angle: np.ndarray, place: np.ndarray, stretch: float) -> np.ndarray:
-        return np.stack([radius * np.cos(angle), radius * np.sin(angle), stretch * place], 1)
+
+def _thinned(index: Int[Tensor, "N"]) -> Int[Tensor, "M"]:
+    """Every k-th, `PLACES` or so."""
+    return index[:: max(1, round(len(index) / PLACES))]
+
+
+def _detail(colors: Float[Tensor, "N 3"], centers: Float[Tensor, "N 3"]) -> np.ndarray:
+    """Differences of the colours' logarithms from those around them, no louder than `CONTRAST`."""
+    logs, places = colors.clamp_min(DARKEST).log().cpu().double().numpy(), centers.cpu().double().numpy()
+    some = _thinned(torch.arange(len(places))).numpy()
+    _, near = cKDTree(places[some]).query(places, min(AVERAGED, len(some)), workers=kernel_threads())
+    around = logs[some][near]
+    mean, deviation = around.mean(1), around.std(1).mean(1, keepdims=True)
+    detail = (logs - mean).clip(-3 * CONTRAST, 3 * CONTRAST)
+    return detail * CONTRAST / np.maximum(deviation, CONTRAST)
+
+
+def _mirrored(along: np.ndarray) -> np.ndarray:
+    """Where the detail at places along the arm is taken from [m]: themselves before the fade, then back and forth."""
+    past = along + RIM_FADE
+    folded = REPEATED - np.abs(past % (2 * REPEATED) - REPEATED)
+    return np.where(past > 0, -RIM_FADE - folded, along)
+
+
+def _blended(detail: np.ndarray, sources: cKDTree, points: np.ndarray) -> np.ndarray:
+    far, near = sources.query(points, min(BLENDED, sources.n), workers=kernel_threads())
+    shares = np.exp(-0.5 * (far**2 - far[:, :1] ** 2) / APART**2)
+    return (detail[near] * shares[..., None]).sum(1) / shares.sum(1)[:, None]
+
+
+def _on_cylinder(radius: float, angle: np.ndarray, place: np.ndarray, stretch: float = 1.0) -> np.ndarray:
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), stretch * place], 1)
+
+
+def _pattern(radius: float, around: np.ndarray, along: np.ndarray, seed: int) -> np.ndarray:
+    """What is added to the logarithms of colours at angles around the arm from the palm and places along it [m]."""
 
     def scattered(distance: float, seed: int, stretch: float = 1.0) -> cKDTree:
         generator = torch.Generator().manual_seed(seed)
@@ -71,11 +138,11 @@ def _pattern(radius: float, around: np.ndarray, along: np.ndarray, seed: int) ->
         count = round(TRIED * area / distance**2)
         angle, place = torch.rand(2, count, generator=generator, dtype=torch.float64).numpy()
         place = SPAN[0] + place * (SPAN[1] - SPAN[0])
-        return cKDTree(apart(on_cylinder(2 * math.pi * angle, place, stretch), distance))
+        return cKDTree(apart(_on_cylinder(radius, 2 * math.pi * angle, place, stretch), distance))
 
-    grain = furrows_and_tones(scattered(CELL, seed + 8, LONGER), on_cylinder(around, along, LONGER), seed + 9)
+    grain = furrows_and_tones(scattered(CELL, seed + 8, LONGER), _on_cylinder(radius, around, along, LONGER), seed + 9)
     blood = np.zeros_like(grain)
     for k, (distance, strength) in enumerate(BLOTCHES):
         among = scattered(distance, seed + 10 + 2 * k)
-        blood += strength * blotches(among, on_cylinder(around, along, 1.0), distance, seed + 11 + 2 * k)
+        blood += strength * blotches(among, _on_cylinder(radius, around, along), distance, seed + 11 + 2 * k)
     return grain[:, None] + blood[:, None] * np.array(BLOOD)

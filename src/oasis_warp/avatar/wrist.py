@@ -18,7 +18,8 @@ from oasis_warp.avatar.anchors import (
     surface_frames,
     vertex_to_gaussians,
 )
-from oasis_warp.avatar.arm_skin import arm_colors
+from oasis_warp.avatar.appearance import skin_regions
+from oasis_warp.avatar.arm_skin import MIRRORED, arm_colors
 from oasis_warp.avatar.densify import GROUND_DEPTH, SKIN, cut_faces, ground_discs, parts_for_spacing
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
@@ -97,8 +98,10 @@ def close_wrist(
     left = vertex_to_gaussians(shade_left(hand, rest), faces, kept)
     near = torch.nonzero(left[:, 0] < LEFT)[:, 0]
     wanted = torch.cat([points, on_parts, centers_at_rest(kept, rest, faces)[near]])
-    known = (own >= 1) & (torch.cdist(centers_at_rest(gaussians, rest, faces), rest[rim]).amin(1) < 2 * RIM_FADE)
-    *read, calm = arm_colors(select(gaussians, known), rest, faces, rim, rim_axis(rest, rim), wanted, seed).split(
+    known = (own >= 1) & (torch.cdist(centers_at_rest(gaussians, rest, faces), rest[rim]).amin(1) < MIRRORED)
+    palm = (skin_regions(hand).palm.to(rest)[:, None] * surface.vertex_normals(rest, faces)).sum(0)
+    skin = select(gaussians, known)
+    *read, calm = arm_colors(skin, rest, faces, rim, rim_axis(rest, rim), palm, wanted, seed).split(
         [len(points), len(on_faces), len(near)]
     )
     mixed = calm * (kept.colors[near].clamp_min(DARKEST) / calm) ** (left[near] / LEFT)
