@@ -93,6 +93,13 @@ def test_the_end_does_not_repeat_what_is_loud_before_it(hand, hands):
     assert (logs - logs.mean(0)).std() < 0.12  # it was .3, and ended at the rim in specks
 
 
+def test_a_black_hand_has_no_colours_that_are_no_numbers(hand, hands):
+    """The hand's colours are mixed with those of the arm by their ratio."""
+    rest, before, _ = hands
+    after = close_wrist(hand, before._replace(colors=torch.zeros_like(before.colors)), rest)
+    assert bool(after.colors.isfinite().all()) and float(after.colors.amax()) < 0.05
+
+
 def test_the_arms_detail_varies_along_it(hand, hands):
     """It repeated the hand's skin in the mirror, which looked like grain of wood, and once one row of it: streaks."""
     rest, before, _ = hands

@@ -104,6 +104,7 @@ def close_wrist(
     *read, calm = arm_colors(skin, rest, faces, rim, rim_axis(rest, rim), palm, wanted, seed).split(
         [len(points), len(on_faces), len(near)]
     )
+    calm = calm.clamp_min(DARKEST)
     mixed = calm * (kept.colors[near].clamp_min(DARKEST) / calm) ** (left[near] / LEFT)
     kept = kept._replace(colors=kept.colors.index_copy(0, near, mixed))
 
