@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.adaptation.sharpen import lit_as_photo
+from oasis_warp.adaptation.sharpen import MIN_ALPHA, lit_as_photo
 from oasis_warp.avatar.anchors import rim_fade, vertex_to_gaussians
 from oasis_warp.avatar.densify import Densified
 from oasis_warp.avatar.observation import faded_in
@@ -23,14 +23,11 @@ BORDER = 3 / 256
 """Share of the photo's side, at the mask's border, that may hold background, and over which pixels count more."""
 WRIST = 0.02
 """Distance from the wrist's end up to which nothing changes, and over which the change grows [m]."""
-FEWEST = 0.05
-"""Least sum of a Gaussian's weights over the pixels that count: less says nothing about its colour."""
+FEWEST, HARDLY_SEEN = 0.05, 1.0
+"""Sums of a Gaussian's weights over the pixels that count: less than the first says nothing about its colour. To keep a
+picture, Gaussians with less than the second change less: at borders of seen skin a pattern like scales appeared."""
 MIN_COLOR = 0.01
 """Least colour whose logarithm is taken."""
-HARDLY_SEEN = 1.0
-"""The same of Gaussians that keep a picture: those at the borders of what is seen became scales."""
-MIN_ALPHA = 0.05
-"""Below it a pixel says nothing about the colour of the hand."""
 MOST, MOST_KEPT = 3.0, 0.3
 """Largest logarithms by which shade and colours change. With more, creases of dark skin, which have next to no blue,
 got specks of it."""

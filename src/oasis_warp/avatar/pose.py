@@ -313,10 +313,10 @@ def pose_gaussians(
 
     Face Gaussians keep their barycentrics, rotate by the blended rotation of the face's corners and grow with the root
     of the face's area. Vertex Gaussians rotate with their vertex and grow with the faces around it together. None gets
-    smaller: skin is pressed together in one direction, and in the other gaps would open. Values
-    are not checked here: the caller has checked the pose. A surface that is posed many times is given as its
-    `rest_mesh`. If `posed_vertices` have a leading axis of poses, so have means, quats and scales. With a `light`, so
-    have the colours: they are drawn in it, without the part that the posed surface hides. With the `center` of a
+    smaller than at rest, unlike in the paper: skin is pressed together in one direction, and gaps would open in the
+    other. Values are not checked here: the caller has checked the pose. A surface that is posed many times is given as
+    its `rest_mesh`. If `posed_vertices` have a leading axis of poses, so have means, quats and scales. With a `light`,
+    so have the colours: they are drawn in it, without the part that the posed surface hides. With the `center` of a
     camera, shade fades as that camera leaves the side of the photo; without, it is as the photo's camera saw it. With
     an `opening`, folds over bent joints are open in that light. With the `closeness` of the `posed_vertices` to other
     skin, little light comes between fingers that touch. With `creases`, those in stretched skin are flat.

@@ -19,7 +19,7 @@ from oasis_warp.avatar.anchors import (
     vertex_to_gaussians,
 )
 from oasis_warp.avatar.appearance import skin_regions
-from oasis_warp.avatar.arm_skin import MIRRORED, arm_colors
+from oasis_warp.avatar.arm_skin import DARKEST, MIRRORED, arm_colors
 from oasis_warp.avatar.densify import GROUND_DEPTH, SKIN, cut_faces, ground_discs, parts_for_spacing
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
@@ -32,8 +32,6 @@ SHADE_FADE = 0.022
 looks like a burn where the arm is missing."""
 LEFT = 0.5
 """Share of the photo's shade that is left where the hand's own colours end to turn into those of the arm."""
-DARKEST = 0.02
-"""Colours are clamped to it before they are mixed [sRGB]."""
 ARM_LENGTH = 0.12
 """The stretch past the rim over which an arm fades out [m]: a hand that ends at once looks sawn off, and one whose arm
 fades within the picture, as 6 cm did beside a thumb that points up, looks cut out."""
