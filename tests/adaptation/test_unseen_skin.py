@@ -19,6 +19,7 @@ from oasis_warp.avatar.pose import with_shade_baked
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig
+from oasis_warp.core.windows import largest_around
 from oasis_warp.ops import depth_map
 
 
@@ -290,8 +291,8 @@ def test_a_dark_scrap_beside_a_finger_does_not_count_and_a_crease_in_the_palm_do
     place, nail = scraps._read(hand, seen)
     outlines = scraps._outlines(seen.face_ids >= 0, place)
     skin = (seen.face_ids >= 0) & (nail < 0.5)
-    beside = (scraps.largest(outlines.inside.float(), 2) > 0) & skin
-    far = (scraps.largest((outlines.inside | outlines.around).float(), 6) == 0) & skin
+    beside = (largest_around(outlines.inside.float(), 2) > 0) & skin
+    far = (largest_around((outlines.inside | outlines.around).float(), 6) == 0) & skin
     assert int(beside.sum()) > 100 and int(far.sum()) > 100
     lines = torch.arange(128)[:, None] % 8 == 0  # dark ones all over
     dark = torch.where(lines[..., None], 0.6, 1.0) * crop.image

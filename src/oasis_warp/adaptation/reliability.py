@@ -10,14 +10,14 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
-from oasis_warp.adaptation.scraps import largest, scrap_share
+from oasis_warp.adaptation.scraps import scrap_share
 from oasis_warp.avatar.anchors import PRIOR_SIZE
 from oasis_warp.avatar.observation import Observation, inner_mask, observe, sample
 from oasis_warp.core.camera import project
 from oasis_warp.core.hand_model import HandModel, finger_of
 from oasis_warp.core.types import HandCrop
+from oasis_warp.core.windows import largest_around, mean_around
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import DepthMap, depth_map
 
@@ -70,11 +70,10 @@ def _background_share(drawn: Float[Tensor, "S S 3"], crop: HandCrop) -> Float[Te
     """How far the colour near the border lies on the way from the hand's to the background's, 0 to 1."""
     side = len(crop.mask)
     outside = (crop.mask < OUTSIDE).to(drawn)
-    planes = torch.cat([crop.image * outside[..., None], outside[..., None]], -1).permute(2, 0, 1)[None]
-    window = 2 * round(STAIN_WINDOW * side / 2) + 1
+    planes = torch.cat([crop.image * outside[..., None], outside[..., None]], -1).permute(2, 0, 1)
     for _ in range(2):
-        planes = avg_pool2d(planes, window, stride=1, padding=window // 2)
-    background = (planes[0, :3] / planes[0, 3:].clamp_min(1e-6)).permute(1, 2, 0)
+        planes = mean_around(planes, round(STAIN_WINDOW * side / 2))
+    background = (planes[:3] / planes[3:].clamp_min(1e-6)).permute(1, 2, 0)
     contrast = background - drawn
     share = ((crop.image - drawn) * contrast).sum(-1) / contrast.square().sum(-1).clamp_min(SAME_COLOR)
     return ((share - FEW) / (MANY - FEW)).clamp(0, 1) * _largest(outside, STAIN_REACH)
@@ -118,7 +117,7 @@ def _other_places(
 
 def _largest(values: Float[Tensor, "S S"], reach: float) -> Float[Tensor, "S S"]:
     """The largest value around each pixel, up to `reach` times the picture's side along both axes."""
-    return largest(values, round(reach * len(values)))
+    return largest_around(values, round(reach * len(values)))
 
 
 SHARPNESS = 2.0

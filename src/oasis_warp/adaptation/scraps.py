@@ -5,11 +5,11 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d
 
 from oasis_warp.adaptation.sh_lighting import ACROSS_SHADING, MIN_COLOR
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import HandCrop
+from oasis_warp.core.windows import largest_around, mean_around
 from oasis_warp.ops import DepthMap
 
 JUMP = 0.008
@@ -54,7 +54,7 @@ def scrap_share(hand: HandModel, drawn: Float[Tensor, "S S 3"], crop: HandCrop, 
     outlines = _outlines(on, place)
     scale = float(crop.camera.K[0, 0] / seen.depth[on].median()) if bool(on.any()) else 0.0  # pixels of a metre
     shaded, inside, around = (
-        largest(where.to(drawn), round(reach * scale))
+        largest_around(where.to(drawn), round(reach * scale))
         for where, reach in ((outlines.inside, SHADOW_REACH), (outlines.inside, REACH), (outlines.around, REACH))
     )
     beside = torch.maximum(inside, around)
@@ -70,14 +70,6 @@ def scrap_share(hand: HandModel, drawn: Float[Tensor, "S S 3"], crop: HandCrop, 
     dark = _between(-grey / usual.clamp_min(LEAST_DARK), *DARKER)
     other = _between(hue / usual_hue.clamp_min(LEAST_HUE), *OTHER_HUE)
     return torch.maximum(shaded * dark, beside * (1 - nail) * other) * on
-
-
-def largest(values: Float[Tensor, "S S"], pixels: int) -> Float[Tensor, "S S"]:
-    """The largest value around each pixel, up to so many pixels along both axes."""
-    planes = values[None, None]
-    for size in ((1, 2 * pixels + 1), (2 * pixels + 1, 1)):  # rows, then columns: the same maximum
-        planes = max_pool2d(planes, size, stride=1, padding=(size[0] // 2, size[1] // 2))
-    return planes[0, 0]
 
 
 def _read(hand: HandModel, seen: DepthMap) -> tuple[Float[Tensor, "S S 3"], Float[Tensor, "S S"]]:
@@ -101,10 +93,10 @@ def _outlines(on: Bool[Tensor, "S S"], place: Float[Tensor, "S S 3"]) -> _Outlin
 
 
 def _mean_around(values: Float[Tensor, "S S 3"], weight: Float[Tensor, "S S"], side: int) -> Float[Tensor, "S S 3"]:
-    planes = torch.cat([values * weight[..., None], weight[..., None]], -1).permute(2, 0, 1)[None]
+    planes = torch.cat([values * weight[..., None], weight[..., None]], -1).permute(2, 0, 1)
     for _ in range(2):
-        planes = avg_pool2d(planes, side // 2 * 2 + 1, stride=1, padding=side // 2)
-    return (planes[0, :3] / planes[0, 3:].clamp_min(1e-6)).permute(1, 2, 0)
+        planes = mean_around(planes, side // 2)
+    return (planes[:3] / planes[3:].clamp_min(1e-6)).permute(1, 2, 0)
 
 
 def _between(values: Tensor, low: float, high: float) -> Tensor:

@@ -10,7 +10,6 @@ does what is fine: a hand without pores, creases and relief looks like wax.
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.avatar.anchors import rim_fade, vertex_colors, vertex_to_gaussians
@@ -20,6 +19,7 @@ from oasis_warp.avatar.sky import arriving, harmonic_basis
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandLight
+from oasis_warp.core.windows import mean_around
 from oasis_warp.ops import BlendWeights, blend_colors, depth_map
 
 MEAN_HARMONICS = (1.0, 0.0, -0.12, -0.15, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -206,11 +206,8 @@ def shading_picture(hand: HandModel, crop: HandCrop, light: HandLight) -> Float[
     on_hand = (seen.face_ids >= 0).to(factor)[..., None]
     inside = (factor[faces[seen.face_ids.clamp_min(0).long()]] * seen.barycentrics[..., None]).sum(-2)
     # the outlines of picture and surface may differ by a few pixels
-    window = 2 * round(OUTLINE_MARGIN * camera.width) + 1
-    planes = torch.cat([inside * on_hand, on_hand], -1).permute(2, 0, 1)[None]
-    for size in ((1, window), (window, 1)):  # rows, then columns: the same mean
-        planes = avg_pool2d(planes, size, stride=1, padding=(size[0] // 2, size[1] // 2))
-    spread = planes[0].permute(1, 2, 0)
+    planes = torch.cat([inside * on_hand, on_hand], -1).permute(2, 0, 1)
+    spread = mean_around(planes, round(OUTLINE_MARGIN * camera.width)).permute(1, 2, 0)
     beyond = torch.where(spread[..., 3:] > 0, spread[..., :3] / spread[..., 3:].clamp_min(1e-6), 1)
     return torch.where(on_hand > 0, inside, beyond)
 

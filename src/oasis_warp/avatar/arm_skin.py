@@ -30,7 +30,9 @@ MIRRORED = 0.05
 REPEATED = MIRRORED - RIM_FADE
 """The stretch after which the mirror turns again [m]: past it the skin's last row would go on as streaks."""
 AVERAGED = 100
-"""Number of nearest of `PLACES`, 6 mm around; detail is the difference of one from their mean."""
+"""Number of nearest of `PLACES`, 6 mm around one; detail is the difference from the mean around the nearest."""
+TOGETHER = 256
+"""Points whose distances to all `PLACES` are computed at once: they fit into a core's cache."""
 BLENDED, APART = 6, 0.0004
 """Places that detail is blended of, and the standard deviation of their weights [m]; the nearest alone is a mosaic."""
 CONTRAST = 0.045
@@ -91,9 +93,12 @@ def arm_colors(
 
 
 def _tone(colors: Float[Tensor, "N 3"], centers: Float[Tensor, "N 3"], points: Tensor) -> Float[Tensor, "M 3"]:
-    squared = torch.cdist(points, centers).square()
-    spread = SMOOTHING**2 + squared.amin(1, keepdim=True)
-    return torch.softmax(-0.5 * squared / spread, 1) @ colors
+    parts = []
+    for some in points.split(TOGETHER):
+        squared = torch.cdist(some, centers).square_()
+        spread = SMOOTHING**2 + squared.amin(1, keepdim=True)
+        parts.append(torch.softmax(squared.mul_(-0.5 / spread), 1) @ colors)
+    return torch.cat(parts)
 
 
 def _thinned(index: Int[Tensor, "N"]) -> Int[Tensor, "M"]:
@@ -105,11 +110,13 @@ def _detail(colors: Float[Tensor, "N 3"], centers: Float[Tensor, "N 3"]) -> np.n
     """Differences of the colours' logarithms from those around them, no louder than `CONTRAST`."""
     logs, places = colors.clamp_min(DARKEST).log().cpu().double().numpy(), centers.cpu().double().numpy()
     some = _thinned(torch.arange(len(places))).numpy()
-    _, near = cKDTree(places[some]).query(places, min(AVERAGED, len(some)), workers=kernel_threads())
+    tree = cKDTree(places[some])
+    _, near = tree.query(places[some], min(AVERAGED, len(some)), workers=kernel_threads())
     around = logs[some][near]
     mean, deviation = around.mean(1), around.std(1).mean(1, keepdims=True)
-    detail = (logs - mean).clip(-3 * CONTRAST, 3 * CONTRAST)
-    return detail * CONTRAST / np.maximum(deviation, CONTRAST)
+    _, nearest = tree.query(places, workers=kernel_threads())
+    detail = (logs - mean[nearest]).clip(-3 * CONTRAST, 3 * CONTRAST)
+    return detail * CONTRAST / np.maximum(deviation[nearest], CONTRAST)
 
 
 def _mirrored(along: np.ndarray) -> np.ndarray:

@@ -5,12 +5,13 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample, max_pool2d, normalize
+from torch.nn.functional import grid_sample, normalize
 
 from oasis_warp.core import surface
 from oasis_warp.core.camera import camera_center
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import HandCrop, TrainingBatch
+from oasis_warp.core.windows import largest_around, mean_around
 from oasis_warp.ops import depth_visibility
 
 RIM_PIXELS = 2
@@ -112,15 +113,14 @@ def facing(
 
 def inner_mask(mask: Float[Tensor, "*B H W"], pixels: int = RIM_PIXELS) -> Float[Tensor, "*B H W"]:
     """The mask without its outermost `pixels`."""
-    planes = -mask.reshape(-1, 1, *mask.shape[-2:])
-    return -max_pool2d(planes, 2 * pixels + 1, stride=1, padding=pixels).view(mask.shape)
+    return -largest_around(-mask, pixels)
 
 
 def faded_in(mask: Float[Tensor, "S S"], border: float) -> Float[Tensor, "S S"]:
     """Share of each pixel that is surely hand; it grows from the mask's border over a width of `border` sides."""
     rim = max(1, round(border * len(mask)))
     inner = inner_mask(mask, 2 * rim)
-    return avg_pool2d(inner[None, None], 2 * rim + 1, stride=1, padding=rim)[0, 0]
+    return mean_around(inner, rim)
 
 
 def project_batch(

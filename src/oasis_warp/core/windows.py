@@ -1,0 +1,21 @@
+"""Means and maxima over squares of pixels, computed along rows, then columns: a square costs the sum of its sides."""
+
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, max_pool2d
+
+
+def mean_around(planes: Float[Tensor, "*B H W"], pixels: int) -> Float[Tensor, "*B H W"]:
+    """The mean over the pixels up to `pixels` away along both axes; 0 beyond the picture counts, too."""
+    rows = planes.reshape(-1, 1, *planes.shape[-2:])
+    for _ in range(2):  # along rows, where memory is contiguous, then turned
+        rows = avg_pool2d(rows, (1, 2 * pixels + 1), stride=1, padding=(0, pixels)).mT.contiguous()
+    return rows.view(planes.shape)
+
+
+def largest_around(planes: Float[Tensor, "*B H W"], pixels: int) -> Float[Tensor, "*B H W"]:
+    """The largest value up to `pixels` away along both axes."""
+    rows = planes.reshape(-1, 1, *planes.shape[-2:])
+    for _ in range(2):
+        rows = max_pool2d(rows, (1, 2 * pixels + 1), stride=1, padding=(0, pixels)).mT.contiguous()
+    return rows.view(planes.shape)
