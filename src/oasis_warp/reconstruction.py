@@ -307,13 +307,14 @@ def _finish(
             gaussians = painted.gaussians
     rest, lights = first.rest.vertices, adaptation.lights
     if lights is not None:
-        gaussians = limit_shade(hand, gaussians, crops, lights[0])
-        gaussians, spread = spread_shade(hand, gaussians, first, lights[0])
-        lights = (match_rim(hand, gaussians, first, spread), *lights[1:])
-        lights = tuple(end_shade(hand, light, rest) for light in lights)
         with stage("detail"):
+            gaussians = limit_shade(hand, gaussians, crops, lights[0])
+            gaussians, spread = spread_shade(hand, gaussians, first, lights[0])
+            lights = (match_rim(hand, gaussians, first, spread), *lights[1:])
+            lights = tuple(end_shade(hand, light, rest) for light in lights)
             gaussians = match_photos(hand, gaussians, close, lights, adaptation.gains)
-    closed = close_wrist(hand, gaussians, rest, min(spacing, ARM_STEP), seed=config.seed)
+    with stage("wrist"):
+        closed = close_wrist(hand, gaussians, rest, min(spacing, ARM_STEP), seed=config.seed)
     return adaptation._replace(gaussians=closed, lights=lights), painted
 
 

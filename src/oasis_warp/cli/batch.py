@@ -191,7 +191,7 @@ def run(options: Batch) -> int:
     make_folders(options.out, order.out)
     with open_cluster(options.workers, options.scheduler, config.device) as (client, n_workers):
         tasks, start = split_tasks(names, n_workers), time.monotonic()
-        run = ManyPhotos(len(names), config, n_workers)
+        run = ManyPhotos(len(names), config, n_workers, pictures=options.pictures)
         try:
             with show_run(Terminal(), run) as shown:
                 worked = work(client, tasks, order, lambda made, kept: _count(run, shown.progress, made, kept))

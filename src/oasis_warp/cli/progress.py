@@ -49,25 +49,26 @@ class Step(NamedTuple):
     """Whether it takes longer in a first run, and so says nothing on the machine's speed."""
 
 
-def reconstruct_plan(config: ReconstructConfig, n_photos: int) -> tuple[Step, ...]:
-    """The steps of `reconstruct` and of its pictures.
+def reconstruct_plan(config: ReconstructConfig, n_photos: int, *, pictures: bool = True) -> tuple[Step, ...]:
+    """The steps of `reconstruct` and, if wanted, of its pictures.
 
     Seconds are those of the process, with one thread, of 5 single photos of the tests and of 2 of one hand, in
     November 2026.
     """
     n, texture = n_photos, USUAL_STEPS if config.steps is None else config.steps
     plan = [
-        Step("prior", 1.0), Step("landmarks", 0.15 + 0.3 * n), Step("fit", 1.05 if n == 1 else 1.9 * n),
+        Step("prior", 1.0), Step("landmarks", 0.15 + 0.3 * n), Step("fit", 1.5 if n == 1 else 1.9 * n),
         Step("outline", 1.15 * n - 0.2), Step("kernels", 0.1, once=True), Step("crop", 0.02 * n),
-        Step("prior", 0.08 + 0.7 * n), *([Step("refinement", 2.0 * n)] if config.refine == "on" else []),
-        Step("outline", 0.45 * n), Step("calibration", 0.1 + 0.8 * n), Step("completion", 0.15 * n),
-        Step("texture", (0.9 + 4.2 * n) * texture / USUAL_STEPS, USUAL_STEPS if config.steps is None else 0),
-        Step("adaptation", 0.02), *[Step("colours", 4.2)] * n, Step("detail", 0.03),
-        *([Step("painting", 1.2)] if config.unseen == "painted" else []), Step("quality", 0.1 + 0.35 * n),
-        Step("summary", 0.4 + 0.2 * n), Step("summary", 0.35), Step("turntable", 1.8), Step("turntable", 1.3),
-        Step("save", 0.02),
+        Step("prior", 0.08 + 0.75 * n), *([Step("refinement", 2.0 * n)] if config.refine == "on" else []),
+        Step("outline", 0.3 * n), Step("calibration", 0.1 + 0.9 * n), Step("completion", 0.12 * n),
+        Step("texture", (0.9 + 4.1 * n) * texture / USUAL_STEPS, USUAL_STEPS if config.steps is None else 0),
+        Step("adaptation", 0.18), *[Step("colours", 3.1)] * n, Step("detail", 0.03),
+        *([Step("painting", 1.5 + 0.7 * n)] if config.unseen == "painted" else []),
+        *([Step("detail", 0.3 + 0.5 * n)] if config.light == "fit" else []), Step("wrist", 2.2),
+        Step("quality", 0.1 + 0.75 * n),
     ]  # fmt: skip
-    return tuple(plan)
+    drawn = Step("summary", 1.5 + 0.2 * n), Step("summary", 0.3), Step("turntable", 7.3), Step("turntable", 0.3)
+    return *plan, *(drawn if pictures else ()), Step("save", 0.07)
 
 
 EDIT_PLAN = (
@@ -167,10 +168,11 @@ class ManyPhotos(Run):
     """
 
     def __init__(
-        self, n_photos: int, config: ReconstructConfig, n_workers: int, *, clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        step = Step("photos", sum(step.seconds for step in reconstruct_plan(config, 1)) / n_workers)
-        super().__init__([step], clock=clock)
+        self, n_photos: int, config: ReconstructConfig, n_workers: int, *, pictures: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:  # fmt: skip
+        plan = reconstruct_plan(config, 1, pictures=pictures)
+        super().__init__([Step("photos", sum(step.seconds for step in plan) / n_workers)], clock=clock)
         self._n = max(1, n_photos)
         self._ready = 0
         self._ended = deque([(0, self._started)], maxlen=LAST_PHOTOS)

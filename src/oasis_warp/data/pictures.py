@@ -5,6 +5,7 @@ import functools
 import shutil
 import subprocess
 from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from itertools import chain
 from pathlib import Path
 
@@ -198,9 +199,13 @@ def _write_vp9(path: Path, part: Path, frames: Iterator[np.ndarray], fps: float,
     writer = _open_writer(path, part, fps, size)
     count = 0
     try:
-        for frame in frames:
-            writer.write(frame)
-            count += 1
+        with ThreadPoolExecutor(1) as encoder:  # encodes a frame while the next one is drawn
+            last = encoder.submit(lambda: None)
+            for frame in frames:
+                last.result()
+                last = encoder.submit(writer.write, frame)
+                count += 1
+            last.result()
     finally:
         writer.release()
     return count
