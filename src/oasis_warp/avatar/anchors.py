@@ -122,8 +122,7 @@ def centers_at_rest(
     gaussians: CanonicalGaussians, rest: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
 ) -> Float[Tensor, "N 3"]:
     """Where Gaussians lie on the surface at rest [m]."""
-    on_faces = (rest[faces[gaussians.face_index]] * gaussians.barycentrics[..., None]).sum(1)
-    return torch.cat([rest[gaussians.vertex_index] + gaussians.offsets, on_faces])
+    return torch.cat([rest[gaussians.vertex_index] + gaussians.offsets, _at_face_gaussians(rest, faces, gaussians)])
 
 
 def vertex_shapes(
@@ -181,9 +180,17 @@ def vertex_to_gaussians(
 ) -> Float[Tensor, "N D"]:
     """A field over the vertices, read at every Gaussian."""
     # index_select and not values[...]: its gradient adds in a fixed order, so equal seeds give equal bits
-    corners = values.index_select(0, faces[anchors.face_index].flatten()).unflatten(0, (-1, 3))
-    on_faces = (corners * anchors.barycentrics[..., None]).sum(1)
-    return torch.cat([values.index_select(0, anchors.vertex_index), on_faces])
+    return torch.cat([values.index_select(0, anchors.vertex_index), _at_face_gaussians(values, faces, anchors)])
+
+
+def _at_face_gaussians(
+    values: Float[Tensor, "V D"], faces: Int[Tensor, "F 3"], anchors: Anchors | CanonicalGaussians
+) -> Float[Tensor, "M D"]:
+    first, second, third = (  # corner after corner: twice as fast as a sum over an axis of three
+        values.index_select(0, faces[:, k].index_select(0, anchors.face_index)) * anchors.barycentrics[:, k, None]
+        for k in range(3)
+    )
+    return first + second + third
 
 
 def gaussian_corners(

@@ -42,6 +42,9 @@ DARKEST = 0.02
 """Colours are clamped to it before their logarithm is taken [sRGB]."""
 SPAN = -0.04, 0.125
 """The stretch along the arm that has a pattern, from the rim [m]."""
+GRAIN_REPEATED = 0.042
+"""The stretch after which grain goes back and forth [m]: one of its cells is like another, and a quarter as many
+points are made."""
 
 
 def arm_colors(
@@ -119,11 +122,15 @@ def _detail(colors: Float[Tensor, "N 3"], centers: Float[Tensor, "N 3"]) -> np.n
     return detail * CONTRAST / np.maximum(deviation[nearest], CONTRAST)
 
 
+def _back_and_forth(places: np.ndarray, length: float) -> np.ndarray:
+    """From 0 to `length`, back to 0, and so on."""
+    return length - np.abs(places % (2 * length) - length)
+
+
 def _mirrored(along: np.ndarray) -> np.ndarray:
     """Where the detail at places along the arm is taken from [m]: themselves before the fade, then back and forth."""
     past = along + RIM_FADE
-    folded = REPEATED - np.abs(past % (2 * REPEATED) - REPEATED)
-    return np.where(past > 0, -RIM_FADE - folded, along)
+    return np.where(past > 0, -RIM_FADE - _back_and_forth(past, REPEATED), along)
 
 
 def _blended(detail: np.ndarray, sources: cKDTree, points: np.ndarray) -> np.ndarray:
@@ -139,17 +146,19 @@ def _on_cylinder(radius: float, angle: np.ndarray, place: np.ndarray, stretch: f
 def _pattern(radius: float, around: np.ndarray, along: np.ndarray, seed: int) -> np.ndarray:
     """What is added to the logarithms of colours at angles around the arm from the palm and places along it [m]."""
 
-    def scattered(distance: float, seed: int, stretch: float = 1.0) -> cKDTree:
+    def scattered(distance: float, seed: int, start: float, end: float, stretch: float = 1.0) -> cKDTree:
         generator = torch.Generator().manual_seed(seed)
-        area = 2 * math.pi * radius * (SPAN[1] - SPAN[0]) * stretch
+        area = 2 * math.pi * radius * (end - start) * stretch
         count = round(TRIED * area / distance**2)
         angle, place = torch.rand(2, count, generator=generator, dtype=torch.float64).numpy()
-        place = SPAN[0] + place * (SPAN[1] - SPAN[0])
+        place = start + place * (end - start)
         return cKDTree(apart(_on_cylinder(radius, 2 * math.pi * angle, place, stretch), distance))
 
-    grain = furrows_and_tones(scattered(CELL, seed + 8, LONGER), _on_cylinder(radius, around, along, LONGER), seed + 9)
+    cells = scattered(CELL, seed + 8, -2 * CELL, GRAIN_REPEATED + 2 * CELL, LONGER)
+    repeated = _back_and_forth(along, GRAIN_REPEATED)
+    grain = furrows_and_tones(cells, _on_cylinder(radius, around, repeated, LONGER), seed + 9)
     blood = np.zeros_like(grain)
     for k, (distance, strength) in enumerate(BLOTCHES):
-        among = scattered(distance, seed + 10 + 2 * k)
+        among = scattered(distance, seed + 10 + 2 * k, *SPAN)
         blood += strength * blotches(among, _on_cylinder(radius, around, along), distance, seed + 11 + 2 * k)
     return grain[:, None] + blood[:, None] * np.array(BLOOD)

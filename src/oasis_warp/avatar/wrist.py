@@ -87,7 +87,8 @@ def close_wrist(
     parts = torch.zeros_like(hand.faces[:, 0]).to(rest.device)
     parts[on_faces] = parts_for_spacing(rest, faces[on_faces], spacing)
     on_faces, places, face_quats, face_scales = cut_faces(rest, faces, parts, SKIN)
-    *arm, arm_opacities = fading_arm(rest, rim, spacing)
+    made = fading_arm(rest.cpu(), rim.cpu(), spacing)  # of hundreds of small rings, which a GPU is slow at
+    *arm, arm_opacities = (part.to(rest.device) for part in made)
     end = rim_line(rest, rim, full.quats[0, rim]), arm
     index, offsets, end_quats, end_scales = (torch.cat(parts) for parts in zip(*end, strict=True))
     discs = ground_discs(SKIN.ground * full.scales[0, vertices])
