@@ -6,7 +6,6 @@ The only file that knows the order of the stages: see `_run`.
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,7 +34,7 @@ from oasis_warp.avatar.quality import (
 )
 from oasis_warp.avatar.wrist import ARM_STEP, close_wrist, end_shade
 from oasis_warp.core import surface
-from oasis_warp.core.config import PAPER_ADAPTATION, AdaptConfig, ReconstructConfig, check_config
+from oasis_warp.core.config import ReconstructConfig, adapt_config, check_config
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent, timed_stage
@@ -246,7 +245,7 @@ def _run(
         if is_low_resolution(config, *fits) and heads is None:
             guesses = [coarsen(hand, guess, crops[0].rest) for guess in guesses]
         adaptation = adapt(
-            hand, guesses, crops, _adaptation(config), resolutions=scales, heads=heads,
+            hand, guesses, crops, adapt_config(config), resolutions=scales, heads=heads,
             perceptual=None if heads is None else perceptual, progress=progress,
         )  # fmt: skip
     with stage("detail"):
@@ -326,14 +325,6 @@ def _guess(
         return [prior(crop) for crop in crops], None
     guess, heads = guess_with_heads(prior, crops[0])
     return [guess], heads
-
-
-def _adaptation(config: ReconstructConfig) -> AdaptConfig:
-    """The options of the adaptation."""
-    if config.adapt == "field":
-        return AdaptConfig(light=config.light, texture_steps=config.steps, seed=config.seed)
-    steps = PAPER_ADAPTATION.texture_steps if config.steps is None else config.steps
-    return replace(PAPER_ADAPTATION, light=config.light, texture_steps=steps, seed=config.seed)
 
 
 def _tuples(gains: Float[Tensor, "K 3"]) -> list[tuple[float, float, float]]:

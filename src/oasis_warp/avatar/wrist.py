@@ -87,7 +87,7 @@ def close_wrist(
     parts = torch.zeros_like(hand.faces[:, 0]).to(rest.device)
     parts[on_faces] = parts_for_spacing(rest, faces[on_faces], spacing)
     on_faces, places, face_quats, face_scales = cut_faces(rest, faces, parts, SKIN)
-    made = fading_arm(rest.cpu(), rim.cpu(), spacing)  # of hundreds of small rings, which a GPU is slow at
+    made = fading_arm(rest.cpu(), rim.cpu(), spacing)  # hundreds of small rings, slow on a GPU
     *arm, arm_opacities = (part.to(rest.device) for part in made)
     end = rim_line(rest, rim, full.quats[0, rim]), arm
     index, offsets, end_quats, end_scales = (torch.cat(parts) for parts in zip(*end, strict=True))

@@ -3,7 +3,7 @@
 The command line imports this module, so that it must stay free of torch: `oasis --help` answers at once.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args, get_origin, get_type_hints
 
@@ -104,6 +104,14 @@ class EditConfig:
     """Steps of the colour fit. One step does the work of many steps of a plain optimizer."""
     size: int = 1024
     """Largest side of the square around the hand [px]; a larger painted picture is scaled down."""
+
+
+def adapt_config(config: ReconstructConfig) -> AdaptConfig:
+    """How a reconstruction with these options is fitted to its photos."""
+    if config.adapt == "field":
+        return AdaptConfig(light=config.light, texture_steps=config.steps, seed=config.seed)
+    steps = PAPER_ADAPTATION.texture_steps if config.steps is None else config.steps
+    return replace(PAPER_ADAPTATION, light=config.light, texture_steps=steps, seed=config.seed)
 
 
 def check_config(config: AdaptConfig | ReconstructConfig | EditConfig, flag: str = "") -> None:
