@@ -186,7 +186,7 @@ def vertex_to_gaussians(
 def _at_face_gaussians(
     values: Float[Tensor, "V D"], faces: Int[Tensor, "F 3"], anchors: Anchors | CanonicalGaussians
 ) -> Float[Tensor, "M D"]:
-    first, second, third = (  # corner after corner: twice as fast as a sum over an axis of three
+    first, second, third = (  # corner after corner: 1.5 to 2.4 times as fast as a sum over an axis of three
         values.index_select(0, faces[:, k].index_select(0, anchors.face_index)) * anchors.barycentrics[:, k, None]
         for k in range(3)
     )

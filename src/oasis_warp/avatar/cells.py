@@ -51,7 +51,7 @@ def _normal(count: int, seed: int) -> np.ndarray:
 def apart(points: np.ndarray, distance: float) -> np.ndarray:
     """Those of [M, D] points, in their order, that no kept one is nearer to than `distance`."""
     pairs = cKDTree(points).query_pairs(distance, output_type="ndarray")
-    first, second = pairs.T.copy()  # each pair in order
+    first, second = pairs.T.copy()  # i < j in each pair
     kept, undecided = np.zeros(len(points), bool), np.ones(len(points), bool)
     while undecided.any():
         both = undecided[first] & undecided[second]

@@ -1,4 +1,4 @@
-"""Means and maxima over squares of pixels, computed along rows, then columns: a square costs the sum of its sides."""
+"""Means and maxima over squares of pixels, along rows, then columns: the cost grows with a side, not with the area."""
 
 from jaxtyping import Float
 from torch import Tensor
@@ -6,7 +6,7 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 
 
 def mean_around(planes: Float[Tensor, "*B H W"], pixels: int) -> Float[Tensor, "*B H W"]:
-    """The mean over the pixels up to `pixels` away along both axes; 0 beyond the picture counts, too."""
+    """The mean over the pixels up to `pixels` away along both axes. Pixels beyond the picture count as 0."""
     rows = planes.reshape(-1, 1, *planes.shape[-2:])
     for _ in range(2):  # along rows, where memory is contiguous, then turned
         rows = avg_pool2d(rows, (1, 2 * pixels + 1), stride=1, padding=(0, pixels)).mT.contiguous()
