@@ -17,7 +17,7 @@ from oasis_warp.avatar.observation import Observation, inner_mask, observe, samp
 from oasis_warp.core.camera import project
 from oasis_warp.core.hand_model import HandModel, finger_of
 from oasis_warp.core.types import HandCrop
-from oasis_warp.core.windows import largest_around, mean_around
+from oasis_warp.core.windows import largest_around, smooth_mean_around
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.ops import DepthMap, depth_map
 
@@ -70,10 +70,7 @@ def _background_share(drawn: Float[Tensor, "S S 3"], crop: HandCrop) -> Float[Te
     """How far the colour near the border lies on the way from the hand's to the background's, 0 to 1."""
     side = len(crop.mask)
     outside = (crop.mask < OUTSIDE).to(drawn)
-    planes = torch.cat([crop.image * outside[..., None], outside[..., None]], -1).permute(2, 0, 1)
-    for _ in range(2):
-        planes = mean_around(planes, round(STAIN_WINDOW * side / 2))
-    background = (planes[:3] / planes[3:].clamp_min(1e-6)).permute(1, 2, 0)
+    background = smooth_mean_around(crop.image, outside, round(STAIN_WINDOW * side / 2))
     contrast = background - drawn
     share = ((crop.image - drawn) * contrast).sum(-1) / contrast.square().sum(-1).clamp_min(SAME_COLOR)
     return ((share - FEW) / (MANY - FEW)).clamp(0, 1) * _largest(outside, STAIN_REACH)

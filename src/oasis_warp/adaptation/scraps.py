@@ -9,7 +9,7 @@ from torch import Tensor
 from oasis_warp.adaptation.sh_lighting import ACROSS_SHADING, MIN_COLOR
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import HandCrop
-from oasis_warp.core.windows import largest_around, mean_around
+from oasis_warp.core.windows import largest_around, smooth_mean_around
 from oasis_warp.ops import DepthMap
 
 JUMP = 0.008
@@ -64,7 +64,8 @@ def scrap_share(hand: HandModel, drawn: Float[Tensor, "S S 3"], crop: HandCrop, 
         return torch.zeros_like(rest)
     beyond = (crop.image.clamp_min(MIN_COLOR) / drawn.clamp_min(MIN_COLOR)).log()
     # A little of what is beside outlines, where there is nothing else around.
-    beyond = beyond - _mean_around(beyond, rest + 0.05 * crop.mask * on * beside, round(AROUND * scale))
+    weight = rest + 0.05 * crop.mask * on * beside
+    beyond = beyond - smooth_mean_around(beyond, weight, round(AROUND * scale) // 2)
     grey, hue = beyond.mean(-1), (beyond @ beyond.new_tensor(ACROSS_SHADING).T).norm(dim=-1)
     usual, usual_hue = (1.48 * values[sure].median() for values in (grey.abs(), hue))
     dark = _between(-grey / usual.clamp_min(LEAST_DARK), *DARKER)
@@ -90,13 +91,6 @@ def _outlines(on: Bool[Tensor, "S S"], place: Float[Tensor, "S S 3"]) -> _Outlin
             found.inside.narrow(axis, k, n).logical_or_(apart)
             found.around.narrow(axis, k, n).logical_or_(on_a != on_b)
     return found
-
-
-def _mean_around(values: Float[Tensor, "S S 3"], weight: Float[Tensor, "S S"], side: int) -> Float[Tensor, "S S 3"]:
-    planes = torch.cat([values * weight[..., None], weight[..., None]], -1).permute(2, 0, 1)
-    for _ in range(2):
-        planes = mean_around(planes, side // 2)
-    return (planes[:3] / planes[3:].clamp_min(1e-6)).permute(1, 2, 0)
 
 
 def _between(values: Tensor, low: float, high: float) -> Tensor:

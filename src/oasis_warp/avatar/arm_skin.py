@@ -28,7 +28,8 @@ OWN_ON_BACK = 0.4
 MIRRORED = 0.05
 """The stretch of skin before the rim whose detail the arm repeats in the mirror [m]."""
 REPEATED = MIRRORED - RIM_FADE
-"""The stretch after which the mirror turns again [m]: past it the skin's last row would go on as streaks."""
+"""The stretch after which the mirror turns again [m]: past it the skin's last row would go on as streaks. The arm's own
+grain is mirrored as often, which saves three quarters of its points."""
 AVERAGED = 100
 """Neighbours, within some 6 mm, over which the mean of each place is taken. Detail is the difference of a colour from
 the mean of the nearest place."""
@@ -43,8 +44,6 @@ DARKEST = 0.02
 """Colours are clamped to it before their logarithm is taken [sRGB]."""
 SPAN = -0.04, 0.125
 """The stretch along the arm that has a pattern, from the rim [m]."""
-GRAIN_REPEATED = 0.042
-"""Grain is mirrored every so often along the arm [m]. That saves three quarters of its points, and cells look alike."""
 
 
 def arm_colors(
@@ -154,8 +153,8 @@ def _pattern(radius: float, around: np.ndarray, along: np.ndarray, seed: int) ->
         place = start + place * (end - start)
         return cKDTree(apart(_on_cylinder(radius, 2 * math.pi * angle, place, stretch), distance))
 
-    cells = scattered(CELL, seed + 8, -2 * CELL, GRAIN_REPEATED + 2 * CELL, LONGER)
-    repeated = _back_and_forth(along, GRAIN_REPEATED)
+    cells = scattered(CELL, seed + 8, -2 * CELL, REPEATED + 2 * CELL, LONGER)
+    repeated = _back_and_forth(along, REPEATED)
     grain = furrows_and_tones(cells, _on_cylinder(radius, around, repeated, LONGER), seed + 9)
     blood = np.zeros_like(grain)
     for k, (distance, strength) in enumerate(BLOTCHES):

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from oasis_warp.core.color import cielab, linear_light, luminance
+from oasis_warp.core.windows import largest_around
 
 SIZE = 256
 """Side of the square pictures in which contrasts are measured [px]."""
@@ -62,10 +62,7 @@ def haze(alpha: Float[Tensor, "H W"], silhouette: Bool[Tensor, "H W"], elsewhere
 
     What lies `elsewhere`, at the end of the wrist, does not count.
     """
-    window, near = 2 * HAZE_REACH + 1, silhouette.to(alpha)[None, None]
-    for size, padding in (((window, 1), (HAZE_REACH, 0)), ((1, window), (0, HAZE_REACH))):
-        near = max_pool2d(near, size, 1, padding)
-    near = near[0, 0] > 0
+    near = largest_around(silhouette.to(alpha), HAZE_REACH) > 0
     return float(alpha[~near & ~elsewhere].sum() / silhouette.sum().clamp_min(1))
 
 

@@ -17,6 +17,7 @@ from oasis_warp.core.camera import camera_center, crop_camera, orbit_camera, pro
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.surface import face_normals
 from oasis_warp.core.types import Camera, HandCrop, HandPose, Render
+from oasis_warp.core.windows import largest_around
 from oasis_warp.estimation.hand_crop import CROP_MARGIN
 from oasis_warp.evaluation.band_energy import SIZE
 from oasis_warp.hand.poses import POSE_NAMES
@@ -159,7 +160,7 @@ def wrist_end(hand: HandModel, vertices: Float[Tensor, "V 3"], camera: Camera) -
 def without_arm(hand: HandModel, drawn: Render, vertices: Float[Tensor, "V 3"], camera: Camera) -> Render:
     """A picture over `GROUND` without the arm, which photos of hands are cut out without, too."""
     on_hand = silhouette(hand.faces, vertices, camera).float()
-    kept = max_pool2d(on_hand[None], 2 * BESIDE + 1, 1, BESIDE)[0] > 0
+    kept = largest_around(on_hand, BESIDE) > 0
     arm = (wrist_end(hand, vertices, camera) & ~kept)[..., None]
     ground = drawn.image.new_tensor(GROUND)
     return Render(torch.where(arm, ground, drawn.image), drawn.alpha.masked_fill(arm[..., 0], 0))
