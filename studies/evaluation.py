@@ -121,7 +121,7 @@ def photos(found: dict[str, Any]) -> str:
     words = f"{rows[0]['pairs']} ordered pairs of {len(found['settings']['photos'])} sets, medians."
     if found["left_out"]:
         words += f" Photos left out: {len(found['left_out'])}."
-    words += f" {where_priors_differ(found['pairs'])}"
+    words += f" {where_priors_differ(found['pairs'])} {hidden_hues(found['pairs'])}"
     shown = with_values(rows, PHOTOS)
     headings = ["method", *(column.heading for column in shown.values())]
     return f"{markdown(headings, [[name_of(row), *cells(row, shown)] for row in rows])}\n\n{words}"
@@ -136,6 +136,19 @@ def where_priors_differ(pairs: list[Record]) -> str:
         parts.append(f"{mean(gain > 0 for gain in most):.0%} by {name}")
     shares = ", ".join(parts)
     return f"Where learned and mean one-shot differ most (a quarter of the pairs), learned is better on {shares}."
+
+
+def hidden_hues(pairs: list[Record]) -> str:
+    """How the errors of hidden skin's hue spread over the pairs of one-shot."""
+    shown = select(pairs, **Method("learned", ONE_SHOT)._asdict())
+    errors = sorted(pair["hue_unseen"] for pair in shown if "hue_unseen" in pair)
+    if not errors:
+        return ""
+    low, middle, high = (errors[round(share * (len(errors) - 1))] for share in (0.25, 0.5, 0.75))
+    return (
+        f"Hue of hidden skin on the {len(errors)} pairs that show enough of it: quartiles {low:.1f}, {middle:.1f} and "
+        f"{high:.1f}, at worst {errors[-1]:.1f}."
+    )
 
 
 SECTIONS = (

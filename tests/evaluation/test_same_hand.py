@@ -5,6 +5,7 @@ import torch
 from synthetic import avatar_of, crop_of
 
 from oasis_warp.avatar.appearance import label_regions, region_colors
+from oasis_warp.core.color import cielab
 from oasis_warp.core.types import Camera, Render
 from oasis_warp.evaluation.band_energy import SIZE
 from oasis_warp.evaluation.same_hand import compare_with_photo
@@ -24,6 +25,23 @@ def test_a_picture_equal_to_the_photo_is_free_of_error_on_any_device(hand, devic
     assert score.ssim_quarter == pytest.approx(1, abs=1e-5)
     assert score.contrasts == pytest.approx([1, 1, 1, 1])
     assert max(score.region_errors.values()) < 0.02
+
+
+def test_the_hue_of_hidden_skin_is_compared_apart_from_that_of_seen_skin(hand):
+    crop, truth, pose = crop_of(hand, torch.full((len(hand.template), 3), 0.6), size=SIZE)
+    half = hand.template[:, 2] > hand.template[:, 2].median()
+    greener = torch.where(half[:, None], torch.tensor([0.6, 0.65, 0.6]), 0.6)
+    drawn, *_ = crop_of(hand, greener, size=SIZE)
+    avatar = avatar_of(hand, truth, pose, crop.camera)
+    compared = lambda: compare_with_photo(avatar, Render(drawn.image, crop.mask), crop, pose).hue_errors  # noqa: E731
+    assert compared() == {}
+    avatar.invented = half.float()
+    found = compared()
+    off = cielab(torch.tensor([[0.6, 0.65, 0.6], [0.6, 0.6, 0.6]]))[:, 1:]
+    assert found["hue_unseen"] == pytest.approx(float((off[0] - off[1]).norm()), rel=0.05)
+    assert found["hue_seen"] < 0.3
+    avatar.invented = torch.zeros(len(half))
+    assert list(compared()) == ["hue_seen"]
 
 
 def moved(parts, device):

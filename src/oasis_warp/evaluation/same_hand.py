@@ -18,6 +18,7 @@ from oasis_warp.avatar.appearance import label_regions, region_masks
 from oasis_warp.avatar.observation import Observation, inner_mask, observe
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.bands import split_bands
+from oasis_warp.core.color import cielab
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
@@ -26,12 +27,12 @@ from oasis_warp.data.output_files import open_resumable_folder, write_file
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
 from oasis_warp.estimation.hand_crop import crop_hand, initial_offsets
-from oasis_warp.evaluation.band_energy import BANDS, SIZE, Contrasts, contrasts, log_brightness
+from oasis_warp.evaluation.band_energy import BANDS, FEWEST, SIZE, Contrasts, contrasts, log_brightness
 from oasis_warp.evaluation.methods import EVEN, KEEP, ONE_SHOT, RAW, Method, method_name, prior_digest
 from oasis_warp.evaluation.metrics import COVERED, color_gain
 from oasis_warp.evaluation.pictures import tile, write_sheet, write_strip
 from oasis_warp.evaluation.summary import Record, read_result, select
-from oasis_warp.evaluation.views import read_crop
+from oasis_warp.evaluation.views import read_crop, read_surface
 from oasis_warp.hand.template import bundled_hand
 from oasis_warp.hand_avatar import Avatar, draw_as_photo, make_avatar
 from oasis_warp.losses import masked_psnr, ssim_map
@@ -56,14 +57,21 @@ SHOWN = 2
 """Pairs of each hand on the sheet."""
 DIGITS = 5
 CONTRASTS = tuple(f"contrast {band}" for band in BANDS)
+HUES = "hue_seen", "hue_unseen"
+"""Of skin that the first photo shows well, and of skin that it hides."""
 MEASURES = (
-    "psnr", "psnr_plain", "ssim_quarter", "overlap", "error", "error_palm", "error_back", "error_nail", *CONTRASTS
+    "psnr", "psnr_plain", "ssim_quarter", "overlap", "error", "error_palm", "error_back", "error_nail", *HUES,
+    *CONTRASTS,
 )  # fmt: skip
-"""Measures of a pair; a colour error or the contrasts are missing where too little of the skin is seen."""
+"""Measures of a pair; an error of colours or the contrasts are missing where too little of the skin is seen."""
 QUARTER = 4
 """Side of the blocks on which structure is compared [px]: a small pose error moves all detail."""
 MIN_VERTICES = 20
 """Fewest vertices of a region whose colour is compared."""
+MIN_SHARE = 0.05
+"""Least share of the hand's interior whose hue is compared."""
+PAINTED = 0.9
+"""Share of paint from which skin counts as hidden; below the rest it counts as seen."""
 
 
 class PairScore(NamedTuple):
@@ -79,6 +87,9 @@ class PairScore(NamedTuple):
     """Distance of the mean colours of each region that the other photo shows [sRGB], after the gain."""
     overlap: float
     """Intersection over union of the drawn hand and the other photo's mask."""
+    hue_errors: dict[str, float]
+    """By `HUES`, the distance of the mean a* and b* (CIELAB), without a gain: exposure and white balance are part of
+    it. Empty for an avatar without painted skin."""
     contrasts: Contrasts | None
     """Contrast of the drawn skin over that of the other photo, by the size of detail (`band_energy.BANDS`); None where
     too little is seen, or where pictures are not of `band_energy.SIZE`."""
@@ -142,8 +153,23 @@ def compare_with_photo(avatar: Avatar, drawn: Render, crop: HandCrop, pose: Hand
         ssim_quarter=_small_ssim(matched, crop.image, weight),
         region_errors=_region_errors(avatar, avatar.pose(pose).colors, crop, gain),
         overlap=float((covered & mask).sum() / (covered | mask).sum().clamp_min(1)),
+        hue_errors=_hue_errors(avatar, drawn, crop) if len(image) == SIZE else {},
         contrasts=_contrast_ratios(image, alpha, crop) if len(image) == SIZE else None,
     )
+
+
+def _hue_errors(avatar: Avatar, drawn: Render, crop: HandCrop) -> dict[str, float]:
+    if avatar.invented is None:
+        return {}
+    hand, posed = avatar.hand, crop.posed.vertices
+    paint = read_surface(hand, posed, crop.camera, avatar.invented, label_regions(hand).palm).visibility
+    where = read_crop(crop).interior & (drawn.alpha >= COVERED)
+    errors = {}
+    for name, part in zip(HUES, (where & (paint <= 1 - PAINTED), where & (paint >= PAINTED)), strict=True):
+        if int(part.sum()) > max(FEWEST, MIN_SHARE * int(where.sum())):
+            own, true = (cielab(image.clamp(0, 1)[part])[:, 1:].mean(0) for image in (drawn.image, crop.image))
+            errors[name] = float((own - true).norm())
+    return errors
 
 
 def _contrast_ratios(image: Tensor, alpha: Tensor, crop: HandCrop) -> Contrasts | None:
@@ -325,6 +351,7 @@ def _record(hand: str, pair: Pair, method: Method) -> Record:
     numbers |= {f"error_{region}": value for region, value in errors.items()}
     if errors:
         numbers["error"] = statistics.fmean(errors.values())
+    numbers |= score.hue_errors
     if score.contrasts is not None:
         numbers |= dict(zip(CONTRASTS, score.contrasts, strict=True))
     return {

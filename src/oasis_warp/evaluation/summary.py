@@ -162,6 +162,8 @@ PHOTOS = {
     "error_palm": Measure("colour of the palm", ".3f"),
     "error_back": Measure("of the back", ".3f"),
     "error_nail": Measure("of the nails", ".3f"),
+    "hue_seen": Measure("hue of seen skin, delta E", ".1f"),
+    "hue_unseen": Measure("of hidden skin", ".1f"),
     **{f"contrast {band}": Measure(f"contrast {band} px", ".2f") for band in BANDS},
     "beaten_psnr": Measure("one-shot better by PSNR", ".0%"),
     "beaten_ssim_quarter": Measure("by SSIM", ".0%"),
