@@ -21,7 +21,7 @@ from oasis_warp.adaptation.adapt import adapt, add_detail
 from oasis_warp.adaptation.reliability import observe_photos
 from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.avatar.quality import over_photo
-from oasis_warp.core.config import AdaptConfig
+from oasis_warp.core.config import adapt_config
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandFit
 from oasis_warp.data.photo import read_photo
@@ -147,7 +147,7 @@ def measure_detail(name: str, options: Options) -> Iterator[Row]:
     guesses = [prior(crop) for crop in crops]
     surfaces = refine_surfaces(hand, photos, fits, surfaces, guesses, config)
     crops, start = crop_hands(photos, fits, surfaces, config), time.perf_counter()
-    settings = AdaptConfig(texture_steps=config.steps)
+    settings = adapt_config(config)
     fusion = adapt(hand, guesses, crops, settings, resolutions=resolutions(fits, crops))
     fused = time.perf_counter()
     close = crop_hands(photos, fits, surfaces, config, finer=True)

@@ -18,7 +18,6 @@ from oasis_warp.cli import summary
 from oasis_warp.cli.options import Reconstruct as ReconstructOptions
 from oasis_warp.cli.progress import (
     EDIT_PLAN,
-    USUAL_STEPS,
     ManyPhotos,
     Run,
     Terminal,
@@ -58,13 +57,13 @@ class Clock:
         return self.now
 
 
-def work(run, clock, plan, pace, watch=lambda: None, *, texture_steps=USUAL_STEPS):
+def work(run, clock, plan, pace, watch=lambda: None):
     """Do the steps of a plan at `pace` times their seconds; `watch` looks now and then."""
     for step in plan:
-        parts, total = (texture_steps, 400) if step.stage == "texture" else (10, 10)
+        total = 56 if step.stage == "texture" else 10
         run(step.stage, 0, total)
-        for k in range(parts):
-            clock.now += pace * step.seconds / (step.usual or parts)
+        for k in range(total):
+            clock.now += pace * step.seconds / total
             watch()
             if step.stage in ("texture", "colours", "turntable"):
                 run(step.stage, k + 1, total)
@@ -84,20 +83,6 @@ def test_the_time_left_is_right_within_a_third_on_machines_of_any_speed(pace, n_
             assert abs(left - (clock.now - now)) <= 0.3 * (clock.now - now)
     shares = [share for _, share, _ in seen]
     assert shares == sorted(shares) and run.share == pytest.approx(1) and run.left == pytest.approx(0)
-
-
-def test_texture_learning_that_ends_early_jumps_and_is_not_counted_to_its_limit():
-    clock, plan = Clock(), reconstruct_plan(ReconstructConfig(), 1)
-    run = Run(plan, clock=clock)
-    names = [step.stage for step in plan]
-    work(run, clock, plan[: names.index("texture")], 1.0)
-    before, whole = run.share, sum(step.seconds for step in plan)
-    for step in range(42):  # as few as it can be
-        clock.now += 5 / USUAL_STEPS
-        run("texture", step + 1, 400)
-    assert run.share - before == pytest.approx(5.1 / whole / 2, rel=0.05)
-    run("texture", 400, 400)
-    assert run.share - before == pytest.approx(5.1 / whole, rel=0.05)
 
 
 def test_a_photo_that_fails_counts_neither_as_work_nor_as_speed():
@@ -126,10 +111,10 @@ def test_without_a_terminal_a_stage_is_a_line_and_long_ones_tell_the_time_left()
     progress = line_progress(lines.append, clock=clock, run=Run(plan, clock=clock))
     progress("adaptation", 0, 1)
     steps = [step for step in plan if step.stage in ("calibration", "completion", "texture")]
-    work(progress, clock, steps, 3.0)
+    work(progress, clock, steps, 5.0)
     progress("adaptation", 1, 1)
     *between, last = lines
-    assert last == f"adaptation: {3 * sum(step.seconds for step in steps):.1f} s"
+    assert last == f"adaptation: {5 * sum(step.seconds for step in steps):.1f} s"
     assert 2 <= len(between) <= 3 and all(line.startswith("texture: ") and "s left" in line for line in between)
     assert not any("400" in line for line in lines)
 

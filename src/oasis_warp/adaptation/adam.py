@@ -17,7 +17,7 @@ class Adam:
     """
 
     def __init__(self, parameters: Sequence[Tensor], learning_rate: float) -> None:
-        self._rate, self._count = learning_rate, 0
+        self.rate, self._count = learning_rate, 0
         self._state = [(p, torch.zeros_like(p), torch.zeros_like(p)) for p in parameters]
 
     @torch.no_grad()
@@ -31,4 +31,4 @@ class Adam:
             mean.lerp_(gradient, 1 - DECAYS[0])
             square.mul_(DECAYS[1]).addcmul_(gradient, gradient, value=1 - DECAYS[1])
             size = (square.sqrt() / corrections[1] ** 0.5).add_(EPSILON)
-            parameter.addcdiv_(mean, size, value=-self._rate / corrections[0])
+            parameter.addcdiv_(mean, size, value=-self.rate / corrections[0])

@@ -23,12 +23,8 @@ from oasis_warp.losses import SsimTarget, masked_dssim, masked_l1, ssim_target
 from oasis_warp.network.heads import ColorHeads, head_colors, zero_updates
 from oasis_warp.ops import BlendWeights, blend_colors
 
-AVERAGED = 10
-"""Steps over which what is learned is averaged: Adam's last steps are as long as its first, each for its own view."""
-MAX_STEPS = 400
-FLAT_WINDOW, FLAT_GAIN = 21, 0.05
-"""Without a given number of steps, learning ends when the loss of this many steps, three rounds of seven reference
-views, fell by less than this share."""
+AVERAGED = 7
+"""Last steps over which what is learned is averaged, one round of the reference views: each step is for its own."""
 
 
 class Targets(NamedTuple):
@@ -78,7 +74,7 @@ def fit_parameters(
     colors: Callable[[], Float[Tensor, "N 3"]],
     penalty: Callable[[], Tensor],
     targets: Targets,
-    learning_rate: float,
+    rates: tuple[float, float],
     config: AdaptConfig,
     progress: Progress,
 ) -> tuple[float, ...]:
@@ -89,7 +85,7 @@ def fit_parameters(
         colors: Colours of the Gaussians with the parameters as they are.
         penalty: Added to the loss of pictures.
         targets: Those pictures.
-        learning_rate: Learning rate of Adam.
+        rates: Adam's learning rates of the first step and of the last; they follow half a cosine.
         config: Steps and weights. With `references` "in_turn" one reference view takes part in each step, all of them
             in turn, in an order that `seed` shuffles; with "all" every one, by the photo's loss.
         progress: Called as work goes on.
@@ -100,8 +96,7 @@ def fit_parameters(
     beyond = (1 - targets.weights.alphas) * targets.picture
     masked = ssim_target(targets.picture * targets.mask[..., None])
     order = torch.Generator().manual_seed(config.seed)
-    optimiser = Adam(parameters, learning_rate)
-    total = MAX_STEPS if config.texture_steps is None else config.texture_steps
+    optimiser, total = Adam(parameters, rates[0]), config.texture_steps
     losses: list[Tensor] = []
     queue: list[int] = []
     means = [torch.zeros_like(parameter) for parameter in parameters]
@@ -115,14 +110,12 @@ def fit_parameters(
         elif targets.references:
             loss = loss + config.weight_reference * _all_reference_losses(now, targets, config)
         loss = loss + penalty()
+        optimiser.rate = rates[1] + (rates[0] - rates[1]) * (1 + math.cos(math.pi * step / total)) / 2
         optimiser.step(loss)
         for mean, value in zip(means, parameters, strict=True):
             mean.lerp_(value.detach(), max(1 / (step + 1), 1 / AVERAGED))
         losses.append(loss.detach())  # read later: on CUDA a step that waits for its loss keeps the next one waiting
         progress("texture", step + 1, total)
-        if config.texture_steps is None and _is_flat(losses):
-            progress("texture", total, total)
-            break
     if losses:
         with torch.no_grad():
             for value, mean in zip(parameters, means, strict=True):
@@ -159,15 +152,8 @@ def _all_reference_losses(colors: Tensor, targets: Targets, config: AdaptConfig)
     return total
 
 
-def _is_flat(losses: list[Tensor]) -> bool:
-    if len(losses) < 2 * FLAT_WINDOW or len(losses) % FLAT_WINDOW:  # ends that differ by a step differ in the result
-        return False
-    last = torch.stack(losses[-2 * FLAT_WINDOW :]).tolist()
-    return sum(last[FLAT_WINDOW:]) > (1 - FLAT_GAIN) * sum(last[:FLAT_WINDOW])
-
-
-LEARNING_RATE = 0.05
-"""Learning rate of the colour logits."""
+LEARNING_RATES = 0.06, 0.006
+"""First and last learning rate of the colour logits: 56 steps come as far as 84 of .05."""
 RESIDUAL_DECAY = 0.02
 """Weight of the squared difference of a face's logit from those of its corners: what lies together looks alike."""
 ROUGHNESS_DECAY = 0.5
@@ -211,7 +197,7 @@ def learn_texture(
             loss = loss + RESIDUAL_DECAY * residual.square().mean()
         return loss
 
-    losses = fit_parameters([field, residual], colors, penalty, targets, LEARNING_RATE, config, progress)
+    losses = fit_parameters([field, residual], colors, penalty, targets, LEARNING_RATES, config, progress)
     with torch.no_grad():
         return Texture(colors(), losses)
 
@@ -261,7 +247,7 @@ def learn_lora(
 
     factors = [factor for update in updates for pair in update for factor in pair if factor.requires_grad]
     nothing = targets.picture.new_zeros(())
-    losses = fit_parameters(factors, colors, lambda: nothing, targets, rate, config, progress)
+    losses = fit_parameters(factors, colors, lambda: nothing, targets, (rate, rate), config, progress)
     with torch.no_grad():
         return Texture(colors(), losses)
 

@@ -25,6 +25,9 @@ TENDONS = (-0.004, 1.0), (0.0025, 0.8)
 TENDON, TENDON_WIDTH, TENDON_END = 0.045, 0.0018, 0.03
 """What light on a tendon adds to the logarithms, its standard deviation and the length over which it ends [m]."""
 
+TABLE = 500
+"""Steps of a wave's period: between them it is off by 4e-4 of its deviation."""
+
 
 def arm_lines(radius: float, angle: np.ndarray, along: np.ndarray, seed: int) -> np.ndarray:
     """What lines add to the logarithms of colours [M, 3].
@@ -58,10 +61,11 @@ def arm_lines(radius: float, angle: np.ndarray, along: np.ndarray, seed: int) ->
 
 
 def _wave(rng: np.random.Generator, place: np.ndarray, length: float) -> np.ndarray:
-    """Smooth noise with a deviation of about 1 that repeats after `length`."""
-    order = np.arange(1, 6)
+    """Smooth noise with a deviation of about 1 that repeats after `length`, read from a table."""
+    order, turns = np.arange(1, 6), np.arange(TABLE + 1)[:, None] / TABLE
     heights, phases = rng.normal(size=5) / order / 1.2, rng.uniform(0, 2 * math.pi, 5)
-    return (heights * np.cos(2 * math.pi * order * place[:, None] / length + phases)).sum(1)
+    wave = (heights * np.cos(2 * math.pi * order * turns + phases)).sum(1)
+    return np.interp(place / length % 1, turns[:, 0], wave)
 
 
 def _bump(distance: np.ndarray, width: float | np.ndarray) -> np.ndarray:

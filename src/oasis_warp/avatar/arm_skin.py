@@ -21,6 +21,8 @@ PLACES = 4000
 """About as many places of the hand's skin count for that average."""
 BLOTCHES = (0.0011, 0.022), (0.0022, 0.018), (0.006, 0.014)
 """Least distances of the points that blotches are made of [m], and what they add to logarithms."""
+FINEST = 0.002
+"""Blotches of points nearer than this are mirrored as grain is [m]."""
 BLOOD = 0.7, 1.0, 1.0
 """Of a blotch, in red, green and blue."""
 OWN_ON_BACK = 0.4
@@ -29,7 +31,7 @@ MIRRORED = 0.05
 """The stretch of skin before the rim whose detail the arm repeats in the mirror [m]."""
 REPEATED = MIRRORED - RIM_FADE
 """The stretch after which the mirror turns again [m]: past it the skin's last row would go on as streaks. The arm's own
-grain is mirrored as often, which saves three quarters of its points."""
+grain and finest blotches are mirrored as often, which saves three quarters of their points."""
 AVERAGED = 100
 """Neighbours, within some 6 mm, over which the mean of each place is taken. Detail is the difference of a colour from
 the mean of the nearest place."""
@@ -158,6 +160,7 @@ def _pattern(radius: float, around: np.ndarray, along: np.ndarray, seed: int) ->
     grain = furrows_and_tones(cells, _on_cylinder(radius, around, repeated, LONGER), seed + 9)
     blood = np.zeros_like(grain)
     for k, (distance, strength) in enumerate(BLOTCHES):
-        among = scattered(distance, seed + 10 + 2 * k, *SPAN)
-        blood += strength * blotches(among, _on_cylinder(radius, around, along), distance, seed + 11 + 2 * k)
+        span, places = (SPAN, along) if distance > FINEST else ((-distance, REPEATED + distance), repeated)
+        among = scattered(distance, seed + 10 + 2 * k, *span)
+        blood += strength * blotches(among, _on_cylinder(radius, around, places), distance, seed + 11 + 2 * k)
     return grain[:, None] + blood[:, None] * np.array(BLOOD)

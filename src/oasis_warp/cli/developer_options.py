@@ -260,7 +260,7 @@ class Evaluate:
     targets: int = 4
     """Pictures to compare each avatar with; 1 to 8 for synthetic people."""
     steps: int | None = None
-    """Steps of texture learning. Default: until the loss is flat."""
+    """Steps of texture learning. Default: 56."""
     size: int = 256
     """Side of the pictures [px]: a multiple of 16 for synthetic hands, 256 for looks."""
     seed: int = 0

@@ -10,7 +10,7 @@ from oasis_warp.avatar.prior import MeanPrior, Prior
 from oasis_warp.cli.developer_options import Evaluate
 from oasis_warp.cli.progress import INTERRUPTED, Run, Step, Terminal, check_device, print_tables, show_run
 from oasis_warp.cli.record import keep_command
-from oasis_warp.core.config import AdaptConfig, ReconstructConfig
+from oasis_warp.core.config import ReconstructConfig, adapt_config
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
 from oasis_warp.evaluation.band_energy import SIZE
@@ -152,7 +152,7 @@ def on_synthetic_hands(options: Evaluate, priors: dict[str, Prior], progress: Pr
     config = SyntheticEvaluation(
         people=options.people,
         capture=CaptureConfig(targets=options.targets, size=options.size, seed=HELD_OUT_SEED + options.seed),
-        adapt=AdaptConfig(texture_steps=options.steps, seed=options.seed),
+        adapt=adapt_config(ReconstructConfig(steps=options.steps, seed=options.seed)),
     )
     device = torch.device(options.device)
     perceptual = None if options.lpips is None else load_lpips(*options.lpips, allow_download=options.allow_download)

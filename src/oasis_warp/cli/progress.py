@@ -13,7 +13,7 @@ from rich.progress import Progress as Bars
 from rich.table import Table
 
 from oasis_warp.cli.record import is_quiet
-from oasis_warp.core.config import ReconstructConfig
+from oasis_warp.core.config import ReconstructConfig, adapt_config
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
 
@@ -33,8 +33,6 @@ NEARLY = 0.95
 """Most of a step that counts as done while it is not."""
 LAST_PHOTOS = 100
 """Photos by which the pace of several workers is judged, and one more that takes its time by plan."""
-USUAL_STEPS = 84
-"""Steps of texture learning of 5 of 6 photos of the tests; its limit is 400."""
 
 
 class Step(NamedTuple):
@@ -43,8 +41,6 @@ class Step(NamedTuple):
     stage: str
     seconds: float
     """On one core of a server of 2024. Only ratios matter: the run itself tells how fast this machine is."""
-    usual: int = 0
-    """Number of its parts after which it usually ends, where the total that it reports is only a limit."""
     once: bool = False
     """Whether it takes longer in a first run, and so says nothing on the machine's speed."""
 
@@ -55,13 +51,13 @@ def reconstruct_plan(config: ReconstructConfig, n_photos: int, *, pictures: bool
     Seconds are those of the process, with one thread, of 5 single photos of the tests and of 2 of one hand, in
     November 2026.
     """
-    n, texture = n_photos, USUAL_STEPS if config.steps is None else config.steps
+    n, texture = n_photos, adapt_config(config).texture_steps
     plan = [
         Step("prior", 1.0), Step("landmarks", 0.15 + 0.3 * n), Step("fit", 1.5 if n == 1 else 1.9 * n),
         Step("outline", 1.15 * n - 0.2), Step("kernels", 0.1, once=True), Step("crop", 0.02 * n),
         Step("prior", 0.08 + 0.75 * n), *([Step("refinement", 2.0 * n)] if config.refine == "on" else []),
         Step("outline", 0.3 * n), Step("calibration", 0.1 + 0.9 * n), Step("completion", 0.12 * n),
-        Step("texture", (0.9 + 4.1 * n) * texture / USUAL_STEPS, USUAL_STEPS if config.steps is None else 0),
+        Step("texture", (0.01 + 0.05 * n) * texture),
         Step("adaptation", 0.18), *[Step("colours", 3.1)] * n, Step("detail", 0.03),
         *([Step("painting", 1.5 + 0.7 * n)] if config.unseen == "painted" else []),
         *([Step("detail", 0.3 + 0.5 * n)] if config.light == "fit" else []), Step("wrist", 2.2),
@@ -120,7 +116,7 @@ class Run:
             self._place, self._inside, self._since = place + 1, 0.0, self._clock()
         elif total > 1:
             self._move(place)
-            self._inside, self._since = min(done / (step.usual or total), NEARLY), self._clock()
+            self._inside, self._since = min(done / total, NEARLY), self._clock()
 
     def _move(self, place: int) -> None:
         """Leave out what lies between here and `place`."""

@@ -30,8 +30,8 @@ class AdaptConfig:
     ablation, all weights of these heads."""
     lora_rank: int = 8
     """Rank of those updates."""
-    texture_steps: int | None = None
-    """Steps of texture learning, which "even" does without; None stops when the loss is flat, after 400 at most."""
+    texture_steps: int = 56
+    """Steps of texture learning, which "even" does without."""
     weight_rgb: float = 10.0
     """Weight of the mean absolute colour difference."""
     weight_ssim: float = 1.0
@@ -85,7 +85,7 @@ class ReconstructConfig:
     unseen: Literal["painted", "plain"] = "painted"
     """Unseen skin: paint plausible folds, veins and nails (varied by --seed), or keep the prior's smooth colours."""
     steps: int | None = None
-    """Steps of texture learning. Default: until the loss is flat."""
+    """Steps of texture learning. Default: 56, or 400 for LoRA."""
     seed: int = 0
     """Random seed. The same seed gives the same avatar."""
     device: Literal["cpu", "cuda"] = "cpu"
@@ -108,10 +108,9 @@ class EditConfig:
 
 def adapt_config(config: ReconstructConfig) -> AdaptConfig:
     """How a reconstruction with these options is fitted to its photos."""
-    if config.adapt == "field":
-        return AdaptConfig(light=config.light, texture_steps=config.steps, seed=config.seed)
-    steps = PAPER_ADAPTATION.texture_steps if config.steps is None else config.steps
-    return replace(PAPER_ADAPTATION, light=config.light, texture_steps=steps, seed=config.seed)
+    usual = AdaptConfig() if config.adapt == "field" else PAPER_ADAPTATION
+    steps = usual.texture_steps if config.steps is None else config.steps
+    return replace(usual, light=config.light, texture_steps=steps, seed=config.seed)
 
 
 def check_config(config: AdaptConfig | ReconstructConfig | EditConfig, flag: str = "") -> None:
@@ -131,7 +130,7 @@ def check_config(config: AdaptConfig | ReconstructConfig | EditConfig, flag: str
     if isinstance(size, int) and not low <= size <= high:
         raise InputError(f"{flag}size {size}: expected {low} to {high} pixels; choose another size.")
     for name, hint in (
-        ("steps", "leave it out for the default"), ("texture_steps", "leave it out to stop automatically"),
+        ("steps", "leave it out for the default"), ("texture_steps", "leave it out for the default"),
         ("calibration_steps", "0 uses the closed form"), ("hand", "0 is the best detection"),
     ):  # fmt: skip
         value = getattr(config, name, None)

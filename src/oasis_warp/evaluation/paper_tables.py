@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 
 from oasis_warp.avatar.prior import Prior
-from oasis_warp.core.config import PAPER_ADAPTATION, AdaptConfig
+from oasis_warp.core.config import ReconstructConfig, adapt_config
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.output_files import write_files
 from oasis_warp.evaluation.data_sets import Row
@@ -124,19 +124,17 @@ def rows_of_tables(priors: dict[str, Prior], ablated: Sequence[Prior], steps: in
     Args:
         priors: With "learned", a network.
         ablated: Networks with one part switched off.
-        steps: Steps of texture learning in every row, instead of the paper's 400 and our own end.
+        steps: Steps of texture learning in every row, instead of the paper's 400 and our own 56.
         seed: Seed of adaptation.
     """
     learned = priors["learned"]
-    shipped = AdaptConfig(texture_steps=steps, seed=seed)
+    shipped = adapt_config(ReconstructConfig(steps=steps, seed=seed))
     rows = [Row(GUESS, "learned", RAW, shipped), Row(SHIPPED, "learned", ONE_SHOT, shipped)]
     rows += [Row(f"pose {degrees:g}", "learned", ONE_SHOT, shipped, degrees) for degrees in POSE_ERRORS]
     if not isinstance(learned, NetworkPrior):
         return rows
     priors["untrained"] = untrained(learned, seed)
-    paper = replace(PAPER_ADAPTATION, seed=seed)
-    if steps is not None:
-        paper = replace(paper, texture_steps=steps)
+    paper = adapt_config(ReconstructConfig(adapt="lora", light="keep", steps=steps, seed=seed))
     variants = {
         "a": ("learned", paper),
         "b": ("untrained", replace(paper, texture="full")),
