@@ -59,7 +59,7 @@ MIN_ALPHA = 0.05
 """Below it a pixel says nothing about the colour of the hand."""
 MIN_FACTOR = 0.02
 """Least factor of the light by which colours are divided."""
-STEPS = 15
+STEPS = 10
 """Steps of the colour fit. It starts at the colours of the photo; 40 steps give the same result."""
 SHRUNK = 2
 """The pictures that are fitted are also fitted this many times smaller: from afar the rasterizer widens fine Gaussians,

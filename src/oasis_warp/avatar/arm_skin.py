@@ -17,8 +17,10 @@ from oasis_warp.core.types import CanonicalGaussians
 
 SMOOTHING = 0.0015
 """Standard deviation of the average of the hand's colours, where they are nearest [m]."""
-PLACES = 4000
-"""About as many places of the hand's skin count for that average."""
+PLACES = 2000
+"""About as many places of the hand's skin count for that average, 1.2 mm apart."""
+DETAIL_PLACES = 4000
+"""And about as many for the mean below detail."""
 BLOTCHES = (0.0011, 0.022), (0.0022, 0.018), (0.006, 0.014)
 """Least distances of the points that blotches are made of [m], and what they add to logarithms."""
 FINEST = 0.002
@@ -90,7 +92,7 @@ def arm_colors(
     detail = _detail(skin.colors[on_faces], centers[on_faces])
     sources = cKDTree(_on_cylinder(radius, angles, places))
     pattern += back * _blended(detail, sources, _on_cylinder(radius, around, _mirrored(along)))
-    near = _thinned(torch.nonzero(torch.cdist(centers, start).amin(1) < 2 * RIM_FADE)[:, 0])
+    near = _thinned(torch.nonzero(torch.cdist(centers, start).amin(1) < 2 * RIM_FADE)[:, 0], PLACES)
     tone = _tone(skin.colors[near], centers[near], points)
     outer = (2 * out / radius - 1).clamp(0, 1)[:, None]
     return (tone * (torch.from_numpy(pattern).to(tone) * outer).exp()).clamp(max=1)
@@ -105,15 +107,15 @@ def _tone(colors: Float[Tensor, "N 3"], centers: Float[Tensor, "N 3"], points: T
     return torch.cat(parts)
 
 
-def _thinned(index: Int[Tensor, "N"]) -> Int[Tensor, "M"]:
-    """Every k-th, `PLACES` or so."""
-    return index[:: max(1, round(len(index) / PLACES))]
+def _thinned(index: Int[Tensor, "N"], count: int) -> Int[Tensor, "M"]:
+    """Every k-th, `count` or so."""
+    return index[:: max(1, round(len(index) / count))]
 
 
 def _detail(colors: Float[Tensor, "N 3"], centers: Float[Tensor, "N 3"]) -> np.ndarray:
     """Differences of the colours' logarithms from those around them, no louder than `CONTRAST`."""
     logs, places = colors.clamp_min(DARKEST).log().cpu().double().numpy(), centers.cpu().double().numpy()
-    some = _thinned(torch.arange(len(places))).numpy()
+    some = _thinned(torch.arange(len(places)), DETAIL_PLACES).numpy()
     tree = cKDTree(places[some])
     _, near = tree.query(places[some], min(AVERAGED, len(some)), workers=kernel_threads())
     around = logs[some][near]

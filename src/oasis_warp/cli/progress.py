@@ -58,9 +58,9 @@ def reconstruct_plan(config: ReconstructConfig, n_photos: int, *, pictures: bool
         Step("prior", 0.08 + 0.75 * n), *([Step("refinement", 2.0 * n)] if config.refine == "on" else []),
         Step("outline", 0.3 * n), Step("calibration", 0.1 + 0.9 * n), Step("completion", 0.12 * n),
         Step("texture", (0.01 + 0.05 * n) * texture),
-        Step("adaptation", 0.18), *[Step("colours", 3.1)] * n, Step("detail", 0.03),
+        Step("adaptation", 0.18), *[Step("colours", 2.3)] * n, Step("detail", 0.03),
         *([Step("painting", 1.5 + 0.7 * n)] if config.unseen == "painted" else []),
-        *([Step("detail", 0.3 + 0.5 * n)] if config.light == "fit" else []), Step("wrist", 2.2),
+        *([Step("detail", 0.3 + 0.5 * n)] if config.light == "fit" else []), Step("wrist", 1.8),
         Step("quality", 0.1 + 0.75 * n),
     ]  # fmt: skip
     drawn = Step("summary", 1.5 + 0.2 * n), Step("summary", 0.3), Step("turntable", 7.3), Step("turntable", 0.3)
