@@ -15,6 +15,8 @@ from oasis_warp.avatar.pose import (
     in_even_light,
     mirror_surface_light,
     pose_gaussians,
+    view_direction,
+    view_share,
     with_photo,
     with_todays_light,
 )
@@ -232,6 +234,14 @@ class Avatar:
             self._canonical, self.hand.faces, self._rest_mesh, posed.vertices, self._light, center, opening,
             posed.closeness, self._creases,
         )  # fmt: skip
+
+    @torch.no_grad()
+    def shade_left(self, vertices: Float[Tensor, "V 3"], camera: Camera) -> float:
+        """Share of the photo's shade in a picture of the posed `vertices` by `camera`; all colours else are alike."""
+        if self._light is None or self._light.photo_view is None:
+            return 1.0
+        center = camera_center(camera.viewmat.to(vertices))
+        return float(view_share(self._light.photo_view, view_direction(vertices, center)))
 
     def render(
         self, camera: Camera, pose: HandPose | str, background: Color = WHITE, *, validate: bool = True

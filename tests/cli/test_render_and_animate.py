@@ -4,9 +4,10 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from synthetic import as_left_hand
 
 from oasis_warp.cli import main
-from oasis_warp.cli.animate import draw_frames, still_camera, turntable
+from oasis_warp.cli.animate import around, draw_frames, still_camera, turntable
 from oasis_warp.core import rotation
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.logging import silent
@@ -76,6 +77,25 @@ def test_a_turntable_turns_once_and_starts_at_the_photo(scene):
     front, back = ((frame < 250).any(-1) for frame in (frames[0], frames[2].flip(1)))
     assert (front & back).sum() / (front | back).sum() > 0.8
     assert len({frame.numpy().tobytes() for frame in frames}) == 4
+
+
+@pytest.mark.parametrize("left", [False, True])
+def test_a_turning_hand_in_its_photos_shade_is_drawn_as_single_pictures_are_and_posed_only_where_shade_fades(
+    scene, left, monkeypatch
+):
+    plain = as_left_hand(scene[2]) if left else scene[2]
+    random = torch.randn(plain.rest.vertices.shape, generator=torch.Generator().manual_seed(1))
+    facing = torch.nn.functional.normalize(random, dim=1)
+    light = HandLight(torch.tensor([[0.9] * 3, *[[0.0] * 3] * 3]), torch.tensor([[0.2] * 3, [1.6] * 3]), torch.ones(3),
+                      torch.full_like(facing, 0.5), facing)  # fmt: skip
+    avatar, calls, pose = plain.with_looks(plain.gaussians, light), [], Avatar.pose
+    monkeypatch.setattr(Avatar, "pose", lambda *args, **named: calls.append(1) or pose(*args, **named))
+    hands = [(avatar, [avatar.source_pose] * 24)]
+    cameras = around(hands, 24, 64, 0.0)
+    frames = list(draw_frames(hands, cameras, background=LOOK["background"], progress=silent, stage="turntable"))
+    assert 3 <= len(calls) <= 12
+    for camera, frame in zip(cameras, frames, strict=True):
+        assert torch.equal(frame, to_uint8(avatar.render(camera, avatar.source_pose).image))
 
 
 def test_a_pose_film_keeps_every_pose_in_the_picture(scene):

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from jaxtyping import UInt8
@@ -46,19 +47,40 @@ def draw_frames(
 ) -> Iterator[UInt8[Tensor, "H W C"]]:
     """A frame for each of the `cameras` and of the poses of every hand; transparent without a `background`.
 
-    Nothing is posed again while every hand keeps its pose and camera.
+    A hand is not posed again while it keeps its pose and no other share of the photo's shade is seen.
     """
     color = BLACK if background is None else background
-    last, gaussians = None, None
+    shown = [_pose(avatar, poses[0], cameras[0]) for avatar, poses in hands]
+    gaussians = _joined(shown)
     for frame, camera in enumerate(cameras):
-        shown = [camera, *(own[frame] for _, own in hands)]
-        if last is None or any(one is not other for one, other in zip(shown, last, strict=True)):
-            posed = [avatar.pose(poses[frame], camera=camera) for avatar, poses in hands]
-            last, gaussians = shown, Gaussians(*map(torch.cat, zip(*posed, strict=True)))
-        assert gaussians is not None
+        last = shown
+        shown = [_pose(avatar, poses[frame], camera, own) for (avatar, poses), own in zip(hands, last, strict=True)]
+        if any(one is not other for one, other in zip(last, shown, strict=True)):
+            gaussians = _joined(shown)
         drawn = render(gaussians, camera, background=color)
         yield to_uint8(drawn.image if background is not None else straight_alpha(drawn))
         progress(stage, frame + 1, len(cameras))
+
+
+class _Posed(NamedTuple):
+    pose: HandPose
+    camera: Camera
+    gaussians: Gaussians
+
+
+def _pose(avatar: Avatar, pose: HandPose, camera: Camera, last: _Posed | None = None) -> _Posed:
+    """The hand as `camera` sees it; `last` where that is the same."""
+    if last is not None and last.pose is pose:
+        if last.camera is camera:
+            return last
+        vertices = avatar.mesh(pose).vertices
+        if avatar.shade_left(vertices, camera) == avatar.shade_left(vertices, last.camera):
+            return last
+    return _Posed(pose, camera, avatar.pose(pose, camera=camera))
+
+
+def _joined(shown: Sequence[_Posed]) -> Gaussians:
+    return Gaussians(*map(torch.cat, zip(*(one.gaussians for one in shown), strict=True)))
 
 
 def turntable(
