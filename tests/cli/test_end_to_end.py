@@ -303,7 +303,7 @@ def test_a_launch_that_fails_in_the_middle_is_told_and_leaves_nothing(avatar_fil
     assert [file.name for file in avatar_file.parent.iterdir()] == [avatar_file.name]
 
 
-SMALL = ["--size", "64", "--steps", "2", "--prior", "none"]
+SMALL = ["--size", "64", "--steps", "2", "--prior", "none", "--unseen", "plain"]
 
 
 def process_of(*arguments, **environment):

@@ -296,7 +296,7 @@ def test_shapes_that_contradict_each_other_leave_the_mean_hand():
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_sides_are_right_in_all_photos_and_fits_as_good_as_we_say_in_every_third_one(estimator, photos):
+def test_sides_are_right_in_all_photos_and_fits_as_good_as_we_say_in_every_fifth_one(estimator, photos):
     hard = {"backlit_victory_14.jpg", "two_fingers_dark_skin_16.jpg"}
     hands, wrong = [], []
     for path in sorted([*photos.rglob("*.jpg"), *photos.rglob("*.png")]):
@@ -308,7 +308,7 @@ def test_sides_are_right_in_all_photos_and_fits_as_good_as_we_say_in_every_third
             wrong.append(path.name)
         hands += [(path, landmarks) for landmarks in found]
     assert wrong == [] and len(hands) >= 68
-    fits = [estimator.fit(read_photo(path), marks, force=path.name in hard) for path, marks in hands[::3]]
+    fits = [estimator.fit(read_photo(path), marks, force=path.name in hard) for path, marks in hands[::5]]
     reprojection, iou = np.array([(fit.reprojection, fit.mask_iou) for fit in fits]).T
     assert np.median(reprojection) < 2.9  # 2.80: pixels outweigh landmarks
     assert np.median(iou) > 0.95

@@ -13,6 +13,7 @@ from datasets.trees import WRITERS
 from oasis_warp.avatar.appearance import label_regions
 from oasis_warp.avatar.wrist import ARM_GROWTH, ARM_LENGTH, rim_axis
 from oasis_warp.cli import evaluate, main
+from oasis_warp.core import config
 from oasis_warp.core.camera import orbit_camera, project
 from oasis_warp.core.color import cielab, linear_light, luminance
 from oasis_warp.core.config import AdaptConfig, ReconstructConfig
@@ -21,7 +22,7 @@ from oasis_warp.core.mirror import mirror_points
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand
-from oasis_warp.evaluation import data_sets, paper_tables
+from oasis_warp.evaluation import data_sets
 from oasis_warp.evaluation.band_energy import BANDS, HAZE_REACH, SIZE, darkest_over_median, haze, mean_light, redness
 from oasis_warp.evaluation.data_sets import Choice, Key, Row, Sample, choose, evaluate_data_set, misposed
 from oasis_warp.evaluation.kernel_distance import LAYERS
@@ -330,8 +331,8 @@ def test_what_cannot_be_read_is_left_out_and_named_and_a_run_goes_on(hand, tmp_p
 @pytest.fixture
 def few_steps(monkeypatch):
     """The paper's 100 steps of calibration are made few, and a frame is timed."""
-    few = replace(paper_tables.PAPER_ADAPTATION, calibration_steps=2, reference_views=1)
-    monkeypatch.setattr(paper_tables, "PAPER_ADAPTATION", few)
+    few = replace(config.PAPER_ADAPTATION, calibration_steps=2, reference_views=1)
+    monkeypatch.setattr(config, "PAPER_ADAPTATION", few)
     monkeypatch.setattr(data_sets, "FRAMES", 1)
 
 
