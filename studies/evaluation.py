@@ -139,15 +139,15 @@ def where_priors_differ(pairs: list[Record]) -> str:
 
 
 def hidden_hues(pairs: list[Record]) -> str:
-    """How the errors of hidden skin's hue spread over the pairs of one-shot."""
+    """How far hidden skin's hue is off, compared with that of seen skin beside it, over the pairs of one-shot."""
     shown = select(pairs, **Method("learned", ONE_SHOT)._asdict())
-    errors = sorted(pair["hue_unseen"] for pair in shown if "hue_unseen" in pair)
+    errors = sorted(pair["hue_between"] for pair in shown if "hue_between" in pair)
     if not errors:
         return ""
     low, middle, high = (errors[round(share * (len(errors) - 1))] for share in (0.25, 0.5, 0.75))
     return (
-        f"Hue of hidden skin on the {len(errors)} pairs that show enough of it: quartiles {low:.1f}, {middle:.1f} and "
-        f"{high:.1f}, at worst {errors[-1]:.1f}."
+        f"Hidden skin's hue, compared with seen skin's, on the {len(errors)} pairs that show both: quartiles {low:.1f}, "
+        f"{middle:.1f} and {high:.1f}, at worst {errors[-1]:.1f}."
     )
 
 

@@ -39,7 +39,7 @@ def test_the_hue_of_hidden_skin_is_compared_apart_from_that_of_seen_skin(hand):
     found = compared()
     off = cielab(torch.tensor([[0.6, 0.65, 0.6], [0.6, 0.6, 0.6]]))[:, 1:]
     assert found["hue_unseen"] == pytest.approx(float((off[0] - off[1]).norm()), rel=0.05)
-    assert found["hue_seen"] < 0.3
+    assert found["hue_seen"] < 0.3 and found["hue_between"] == pytest.approx(found["hue_unseen"], abs=0.3)
     avatar.invented = torch.zeros(len(half))
     assert list(compared()) == ["hue_seen"]
 

@@ -57,8 +57,9 @@ SHOWN = 2
 """Pairs of each hand on the sheet."""
 DIGITS = 5
 CONTRASTS = tuple(f"contrast {band}" for band in BANDS)
-HUES = "hue_seen", "hue_unseen"
-"""Of skin that the first photo shows well, and of skin that it hides."""
+HUES = "hue_seen", "hue_unseen", "hue_between"
+"""Of skin that the first photo shows well, of skin that it hides, and of the difference of both, which exposure and
+white balance hardly change."""
 MEASURES = (
     "psnr", "psnr_plain", "ssim_quarter", "overlap", "error", "error_palm", "error_back", "error_nail", *HUES,
     *CONTRASTS,
@@ -88,8 +89,7 @@ class PairScore(NamedTuple):
     overlap: float
     """Intersection over union of the drawn hand and the other photo's mask."""
     hue_errors: dict[str, float]
-    """By `HUES`, the distance of the mean a* and b* (CIELAB), without a gain: exposure and white balance are part of
-    it. Empty for an avatar without painted skin."""
+    """By `HUES`, the distance of the mean a* and b* (CIELAB), without a gain. Empty for an avatar without paint."""
     contrasts: Contrasts | None
     """Contrast of the drawn skin over that of the other photo, by the size of detail (`band_energy.BANDS`); None where
     too little is seen, or where pictures are not of `band_energy.SIZE`."""
@@ -164,12 +164,14 @@ def _hue_errors(avatar: Avatar, drawn: Render, crop: HandCrop) -> dict[str, floa
     hand, posed = avatar.hand, crop.posed.vertices
     paint = read_surface(hand, posed, crop.camera, avatar.invented, label_regions(hand).palm).visibility
     where = read_crop(crop).interior & (drawn.alpha >= COVERED)
-    errors = {}
-    for name, part in zip(HUES, (where & (paint <= 1 - PAINTED), where & (paint >= PAINTED)), strict=True):
+    shifts = {}
+    for name, part in zip(HUES[:2], (where & (paint <= 1 - PAINTED), where & (paint >= PAINTED)), strict=True):
         if int(part.sum()) > max(FEWEST, MIN_SHARE * int(where.sum())):
             own, true = (cielab(image.clamp(0, 1)[part])[:, 1:].mean(0) for image in (drawn.image, crop.image))
-            errors[name] = float((own - true).norm())
-    return errors
+            shifts[name] = own - true
+    if len(shifts) == 2:
+        shifts[HUES[2]] = shifts[HUES[1]] - shifts[HUES[0]]
+    return {name: float(shift.norm()) for name, shift in shifts.items()}
 
 
 def _contrast_ratios(image: Tensor, alpha: Tensor, crop: HandCrop) -> Contrasts | None:

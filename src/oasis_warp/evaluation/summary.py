@@ -164,6 +164,7 @@ PHOTOS = {
     "error_nail": Measure("of the nails", ".3f"),
     "hue_seen": Measure("hue of seen skin, delta E", ".1f"),
     "hue_unseen": Measure("of hidden skin", ".1f"),
+    "hue_between": Measure("of their difference", ".1f"),
     **{f"contrast {band}": Measure(f"contrast {band} px", ".2f") for band in BANDS},
     "beaten_psnr": Measure("one-shot better by PSNR", ".0%"),
     "beaten_ssim_quarter": Measure("by SSIM", ".0%"),
