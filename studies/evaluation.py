@@ -146,8 +146,8 @@ def hidden_hues(pairs: list[Record]) -> str:
         return ""
     low, middle, high = (errors[round(share * (len(errors) - 1))] for share in (0.25, 0.5, 0.75))
     return (
-        f"Hidden skin's hue, compared with seen skin's, on the {len(errors)} pairs that show both: quartiles {low:.1f}, "
-        f"{middle:.1f} and {high:.1f}, at worst {errors[-1]:.1f}."
+        f"Hidden skin's hue, compared with seen skin's, on the {len(errors)} pairs that show both: quartiles "
+        f"{low:.1f}, {middle:.1f} and {high:.1f}, at worst {errors[-1]:.1f}."
     )
 
 
