@@ -19,7 +19,7 @@ from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.camera import orbit_camera, project
-from oasis_warp.core.config import AdaptConfig, ReconstructConfig
+from oasis_warp.core.config import ReconstructConfig, adapt_config
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import Camera, HandFit, HandPose, Landmarks, Photo
 from oasis_warp.data.photo import read_photo
@@ -121,7 +121,7 @@ def make_truth(hand: HandModel, prior: Prior, *, back: bool, size: int, steps: i
     fit = HandFit("right", shape, pose, camera, landmarks, drawn.alpha, 0.0, 0.0, 1.0, 0.0, ())
     still = torch.zeros_like(hand.template)
     crop = crop_hand(photo, fit, still, ReconstructConfig())
-    adapted = adapt(hand, [prior(crop)], [crop], AdaptConfig(texture_steps=steps))
+    adapted = adapt(hand, [prior(crop)], [crop], adapt_config(ReconstructConfig(steps=steps)))
     avatar = Avatar(
         side="right", shape=shape, surface_offsets=still, gaussians=adapted.gaussians, source_pose=pose,
         source_camera=crop.camera, light=adapted.light,

@@ -236,7 +236,7 @@ class Avatar:
         )  # fmt: skip
 
     @torch.no_grad()
-    def shade_left(self, vertices: Float[Tensor, "V 3"], camera: Camera) -> float:
+    def shade_share(self, vertices: Float[Tensor, "V 3"], camera: Camera) -> float:
         """Share of the photo's shade in a picture of the posed `vertices` by `camera`; all colours else are alike."""
         if self._light is None or self._light.photo_view is None:
             return 1.0

@@ -74,7 +74,7 @@ def _pose(avatar: Avatar, pose: HandPose, camera: Camera, last: _Posed | None = 
         if last.camera is camera:
             return last
         vertices = avatar.mesh(pose).vertices
-        if avatar.shade_left(vertices, camera) == avatar.shade_left(vertices, last.camera):
+        if avatar.shade_share(vertices, camera) == avatar.shade_share(vertices, last.camera):
             return last
     return _Posed(pose, camera, avatar.pose(pose, camera=camera))
 
