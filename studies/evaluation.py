@@ -121,7 +121,7 @@ def photos(found: dict[str, Any]) -> str:
     words = f"{rows[0]['pairs']} ordered pairs of {len(found['settings']['photos'])} sets, medians."
     if found["left_out"]:
         words += f" Photos left out: {len(found['left_out'])}."
-    words += f" {where_priors_differ(found['pairs'])} {hidden_hues(found['pairs'])}"
+    words += f" {where_priors_differ(found['pairs'])} {hidden_chroma(found['pairs'])}"
     shown = with_values(rows, PHOTOS)
     headings = ["method", *(column.heading for column in shown.values())]
     return f"{markdown(headings, [[name_of(row), *cells(row, shown)] for row in rows])}\n\n{words}"
@@ -138,16 +138,16 @@ def where_priors_differ(pairs: list[Record]) -> str:
     return f"Where learned and mean one-shot differ most (a quarter of the pairs), learned is better on {shares}."
 
 
-def hidden_hues(pairs: list[Record]) -> str:
-    """How far hidden skin's hue is off, compared with that of seen skin beside it, over the pairs of one-shot."""
+def hidden_chroma(pairs: list[Record]) -> str:
+    """How far a* and b* of hidden skin are off, compared with seen skin beside it, over the pairs of one-shot."""
     shown = select(pairs, **Method("learned", ONE_SHOT)._asdict())
-    errors = sorted(pair["hue_between"] for pair in shown if "hue_between" in pair)
+    errors = sorted(pair["chroma_between"] for pair in shown if "chroma_between" in pair)
     if not errors:
         return ""
     low, middle, high = (errors[round(share * (len(errors) - 1))] for share in (0.25, 0.5, 0.75))
     return (
-        f"Hidden skin's hue, compared with seen skin's, on the {len(errors)} pairs that show both: quartiles "
-        f"{low:.1f}, {middle:.1f} and {high:.1f}, at worst {errors[-1]:.1f}."
+        f"The a* and b* of hidden skin, compared with seen skin's, on the {len(errors)} pairs that show both: "
+        f"quartiles {low:.1f}, {middle:.1f} and {high:.1f}, at worst {errors[-1]:.1f}."
     )
 
 

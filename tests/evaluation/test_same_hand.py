@@ -27,21 +27,21 @@ def test_a_picture_equal_to_the_photo_is_free_of_error_on_any_device(hand, devic
     assert max(score.region_errors.values()) < 0.02
 
 
-def test_the_hue_of_hidden_skin_is_compared_apart_from_that_of_seen_skin(hand):
+def test_the_chromaticity_of_hidden_skin_is_compared_apart_from_that_of_seen_skin(hand):
     crop, truth, pose = crop_of(hand, torch.full((len(hand.template), 3), 0.6), size=SIZE)
     half = hand.template[:, 2] > hand.template[:, 2].median()
     greener = torch.where(half[:, None], torch.tensor([0.6, 0.65, 0.6]), 0.6)
     drawn, *_ = crop_of(hand, greener, size=SIZE)
     avatar = avatar_of(hand, truth, pose, crop.camera)
-    compared = lambda: compare_with_photo(avatar, Render(drawn.image, crop.mask), crop, pose).hue_errors  # noqa: E731
+    compared = lambda: compare_with_photo(avatar, Render(drawn.image, crop.mask), crop, pose).chroma_errors  # noqa: E731
     assert compared() == {}
     avatar.invented = half.float()
     found = compared()
     off = cielab(torch.tensor([[0.6, 0.65, 0.6], [0.6, 0.6, 0.6]]))[:, 1:]
-    assert found["hue_unseen"] == pytest.approx(float((off[0] - off[1]).norm()), rel=0.05)
-    assert found["hue_seen"] < 0.3 and found["hue_between"] == pytest.approx(found["hue_unseen"], abs=0.3)
+    assert found["chroma_hidden"] == pytest.approx(float((off[0] - off[1]).norm()), rel=0.05)
+    assert found["chroma_seen"] < 0.3 and found["chroma_between"] == pytest.approx(found["chroma_hidden"], abs=0.3)
     avatar.invented = torch.zeros(len(half))
-    assert list(compared()) == ["hue_seen"]
+    assert list(compared()) == ["chroma_seen"]
 
 
 def moved(parts, device):

@@ -17,7 +17,9 @@ class Adam:
     """
 
     def __init__(self, parameters: Sequence[Tensor], learning_rate: float) -> None:
-        self.rate, self._count = learning_rate, 0
+        self.rate = learning_rate
+        """Of the next step."""
+        self._count = 0
         self._state = [(p, torch.zeros_like(p), torch.zeros_like(p)) for p in parameters]
 
     @torch.no_grad()

@@ -24,7 +24,7 @@ from oasis_warp.network.heads import ColorHeads, head_colors, zero_updates
 from oasis_warp.ops import BlendWeights, blend_colors
 
 AVERAGED = 7
-"""Last steps over which what is learned is averaged, one round of the reference views: each step is for its own."""
+"""The result is the mean of so many last steps, one for each reference view."""
 
 
 class Targets(NamedTuple):

@@ -55,7 +55,7 @@ def draw_frames(
     for frame, camera in enumerate(cameras):
         last = shown
         shown = [_pose(avatar, poses[frame], camera, own) for (avatar, poses), own in zip(hands, last, strict=True)]
-        if any(one is not other for one, other in zip(last, shown, strict=True)):
+        if any(one.gaussians is not other.gaussians for one, other in zip(last, shown, strict=True)):
             gaussians = _joined(shown)
         drawn = render(gaussians, camera, background=color)
         yield to_uint8(drawn.image if background is not None else straight_alpha(drawn))
@@ -66,17 +66,19 @@ class _Posed(NamedTuple):
     pose: HandPose
     camera: Camera
     gaussians: Gaussians
+    vertices: Tensor | None = None
+    """Posed mesh; None until a second camera sees the same pose."""
 
 
 def _pose(avatar: Avatar, pose: HandPose, camera: Camera, last: _Posed | None = None) -> _Posed:
-    """The hand as `camera` sees it; `last` where that is the same."""
-    if last is not None and last.pose is pose:
-        if last.camera is camera:
-            return last
-        vertices = avatar.mesh(pose).vertices
-        if avatar.shade_share(vertices, camera) == avatar.shade_share(vertices, last.camera):
-            return last
-    return _Posed(pose, camera, avatar.pose(pose, camera=camera))
+    """The hand as `camera` sees it, with the Gaussians of `last` where they are the same."""
+    if last is None or last.pose is not pose:
+        return _Posed(pose, camera, avatar.pose(pose, camera=camera))
+    if last.camera is camera:
+        return last
+    vertices = avatar.mesh(pose).vertices if last.vertices is None else last.vertices
+    same = avatar.shade_share(vertices, camera) == avatar.shade_share(vertices, last.camera)
+    return _Posed(pose, camera, last.gaussians if same else avatar.pose(pose, camera=camera), vertices)
 
 
 def _joined(shown: Sequence[_Posed]) -> Gaussians:

@@ -57,11 +57,11 @@ SHOWN = 2
 """Pairs of each hand on the sheet."""
 DIGITS = 5
 CONTRASTS = tuple(f"contrast {band}" for band in BANDS)
-HUES = "hue_seen", "hue_unseen", "hue_between"
+CHROMA = "chroma_seen", "chroma_hidden", "chroma_between"
 """Of skin that the first photo shows well, of skin that it hides, and of the difference of both, which exposure and
 white balance hardly change."""
 MEASURES = (
-    "psnr", "psnr_plain", "ssim_quarter", "overlap", "error", "error_palm", "error_back", "error_nail", *HUES,
+    "psnr", "psnr_plain", "ssim_quarter", "overlap", "error", "error_palm", "error_back", "error_nail", *CHROMA,
     *CONTRASTS,
 )  # fmt: skip
 """Measures of a pair; an error of colours or the contrasts are missing where too little of the skin is seen."""
@@ -70,7 +70,7 @@ QUARTER = 4
 MIN_VERTICES = 20
 """Fewest vertices of a region whose colour is compared."""
 MIN_SHARE = 0.05
-"""Least share of the hand's interior whose hue is compared."""
+"""Least share of the hand's interior whose a* and b* are compared."""
 PAINTED = 0.9
 """Share of paint from which skin counts as hidden; below the rest it counts as seen."""
 
@@ -88,8 +88,8 @@ class PairScore(NamedTuple):
     """Distance of the mean colours of each region that the other photo shows [sRGB], after the gain."""
     overlap: float
     """Intersection over union of the drawn hand and the other photo's mask."""
-    hue_errors: dict[str, float]
-    """By `HUES`, the distance of the mean a* and b* (CIELAB), without a gain. Empty for an avatar without paint."""
+    chroma_errors: dict[str, float]
+    """By `CHROMA`, the distance of the mean a* and b* (CIELAB), without a gain. Empty for an avatar without paint."""
     contrasts: Contrasts | None
     """Contrast of the drawn skin over that of the other photo, by the size of detail (`band_energy.BANDS`); None where
     too little is seen, or where pictures are not of `band_energy.SIZE`."""
@@ -153,24 +153,24 @@ def compare_with_photo(avatar: Avatar, drawn: Render, crop: HandCrop, pose: Hand
         ssim_quarter=_small_ssim(matched, crop.image, weight),
         region_errors=_region_errors(avatar, avatar.pose(pose).colors, crop, gain),
         overlap=float((covered & mask).sum() / (covered | mask).sum().clamp_min(1)),
-        hue_errors=_hue_errors(avatar, drawn, crop) if len(image) == SIZE else {},
+        chroma_errors=_chroma_errors(avatar, drawn, crop) if len(image) == SIZE else {},
         contrasts=_contrast_ratios(image, alpha, crop) if len(image) == SIZE else None,
     )
 
 
-def _hue_errors(avatar: Avatar, drawn: Render, crop: HandCrop) -> dict[str, float]:
+def _chroma_errors(avatar: Avatar, drawn: Render, crop: HandCrop) -> dict[str, float]:
     if avatar.invented is None:
         return {}
     hand, posed = avatar.hand, crop.posed.vertices
     paint = read_surface(hand, posed, crop.camera, avatar.invented, label_regions(hand).palm).visibility
     where = read_crop(crop).interior & (drawn.alpha >= COVERED)
     shifts = {}
-    for name, part in zip(HUES[:2], (where & (paint <= 1 - PAINTED), where & (paint >= PAINTED)), strict=True):
+    for name, part in zip(CHROMA[:2], (where & (paint <= 1 - PAINTED), where & (paint >= PAINTED)), strict=True):
         if int(part.sum()) > max(FEWEST, MIN_SHARE * int(where.sum())):
             own, true = (cielab(image.clamp(0, 1)[part])[:, 1:].mean(0) for image in (drawn.image, crop.image))
             shifts[name] = own - true
     if len(shifts) == 2:
-        shifts[HUES[2]] = shifts[HUES[1]] - shifts[HUES[0]]
+        shifts[CHROMA[2]] = shifts[CHROMA[1]] - shifts[CHROMA[0]]
     return {name: float(shift.norm()) for name, shift in shifts.items()}
 
 
@@ -353,7 +353,7 @@ def _record(hand: str, pair: Pair, method: Method) -> Record:
     numbers |= {f"error_{region}": value for region, value in errors.items()}
     if errors:
         numbers["error"] = statistics.fmean(errors.values())
-    numbers |= score.hue_errors
+    numbers |= score.chroma_errors
     if score.contrasts is not None:
         numbers |= dict(zip(CONTRASTS, score.contrasts, strict=True))
     return {
