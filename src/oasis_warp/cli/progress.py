@@ -49,7 +49,7 @@ def reconstruct_plan(config: ReconstructConfig, n_photos: int, *, pictures: bool
     """The steps of `reconstruct` and, if wanted, of its pictures.
 
     Seconds are those of the process, with one thread, of 5 single photos of the tests and of 2 of one hand, in
-    November 2026.
+    November 2026; texture, colours and wrist were scaled to one photo when they took fewer steps.
     """
     n, texture = n_photos, adapt_config(config).texture_steps
     plan = [
