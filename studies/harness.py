@@ -67,7 +67,7 @@ class AvatarOptions(StudyOptions):
     prior: str = "learned"
     """learned, none or a weights file."""
     steps: int | None = None
-    """Steps of texture learning; by default until its loss is flat."""
+    """Steps of texture learning, those of `AdaptConfig` if None."""
 
     def config(self, **changes: Any) -> ReconstructConfig:
         """Options of `reconstruct`."""

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from oasis_warp.avatar.anchors import gaussian_corners
 from oasis_warp.avatar.creases import Creases, find_creases
 from oasis_warp.avatar.folds import Folds, find_folds, open_folds
 from oasis_warp.avatar.pose import (
@@ -130,6 +131,7 @@ class Avatar:
             center = camera_center(camera.viewmat.to(vertices))
             photo = self._photo_surface()
             known = with_photo(light, self.rest.vertices, photo, self.hand.faces, center)
+            known = known._replace(corners=gaussian_corners(self.hand.faces, gaussians))
             self._light = mirror_surface_light(known) if left else known
             self._folds = find_folds(self.hand, gaussians, invented, source_pose.angles.to(vertices))
             self._creases = find_creases(self.hand, gaussians, invented, photo, self._folds)

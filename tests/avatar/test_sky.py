@@ -27,7 +27,7 @@ from oasis_warp.avatar.sky import (
     sky_mesh,
     studio_light,
 )
-from oasis_warp.core import rotation
+from oasis_warp.core import rotation, surface
 from oasis_warp.core.camera import camera_center
 from oasis_warp.core.mirror import mirror_light, mirror_points
 from oasis_warp.core.types import HandLight
@@ -58,7 +58,7 @@ def seen(hand, crop, posed):
 def test_the_coarse_mesh_is_that_of_the_hand(hand):
     mesh = sky_mesh(torch.device("cpu"))
     assert int(mesh.vertices.max()) < len(hand.template) and int(mesh.faces.max()) < len(mesh.vertices)
-    read = (hand.template[mesh.vertices][mesh.corners] * mesh.weights[..., None]).sum(1)
+    read = surface.read_at(hand.template[mesh.vertices], mesh.corners)
     assert float((read - hand.template).norm(dim=1).max()) < 0.003
     assert float(hand.weights[mesh.still, 0]) > 0.99
 

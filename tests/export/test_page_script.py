@@ -13,12 +13,13 @@ from synthetic import avatar_of, crop_of
 from tests.export.page_parts import LARGEST, section
 
 from oasis_kernels import constants
+from oasis_kernels.scene import sky_exposure as kernels
 from oasis_warp.avatar import pose
 from oasis_warp.avatar.sky import studio_light
 from oasis_warp.core.camera import ORBIT_FIELD_OF_VIEW, orbit_camera
 from oasis_warp.export.page_data import NO_JOINT, unpack_data
 from oasis_warp.export.page_file import page_html, page_text
-from oasis_warp.ops import contact, sky_exposure
+from oasis_warp.ops import contact
 from oasis_warp.reference import posing
 
 NODE = shutil.which("node")
@@ -37,10 +38,9 @@ NODE = shutil.which("node")
         ("shading.js", "NO_JOINT", NO_JOINT),
         ("shading.js", "WEAK", pose.WEAK),
         ("shading.js", "DEEP", pose.DEEP),
-        ("sky.js", "BUFFER", sky_exposure.SIZE),
-        ("sky.js", "FAR", sky_exposure.DISTANCE),
-        ("sky.js", "MARGIN", sky_exposure.MARGIN),
-        ("sky.js", "LIFT", sky_exposure.LIFT),
+        ("sky.js", "BUFFER", kernels.SIZE),
+        ("sky.js", "MARGIN", kernels.MARGIN),
+        ("sky.js", "LIFT", kernels.LIFT),
         ("contact.js", "DEEPEST", contact.DEEPEST),
         ("contact.js", "ASIDE", contact.ASIDE),
         ("contact.js", "PUSH", contact.MARGIN),

@@ -1,5 +1,7 @@
 """Spherical harmonics against the textbook and as colours of Gaussians; how much of the sky vertices see."""
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
@@ -7,10 +9,13 @@ import trimesh
 from rasterization_scenes import ordinary_scene
 from scipy.special import sph_harm_y
 
+from oasis_kernels.scene import sky_exposure as kernels
 from oasis_warp.core import rotation, surface
 from oasis_warp.core.mirror import mirror_points
 from oasis_warp.ops import rasterization, spherical_harmonics
-from oasis_warp.ops.sky_exposure import sky_directions, sky_exposure
+from oasis_warp.ops.depth_map import depth_map
+from oasis_warp.ops.sky_exposure import N_DIRECTIONS, sky_directions, sky_exposure
+from oasis_warp.ops.smoothing import smooth_over_faces
 from oasis_warp.ops.spherical_harmonics import sh_to_rgb
 from oasis_warp.reference import rasterization as reference
 from oasis_warp.reference.rasterization import sh_to_rgb as expected_colors
@@ -284,6 +289,48 @@ def test_a_surface_is_the_same_in_a_batch_as_alone(ball_by_wall):
         torch.testing.assert_close(together.flip(0), alone, atol=0.02, rtol=0)
     else:
         assert torch.equal(together.flip(0), alone)
+
+
+def exposed_by_depth_maps(vertices, faces, radiance):
+    """The same from perspective depth maps of very far cameras, one for each direction."""
+    sky, size, lift, far = sky_directions(vertices.device), kernels.SIZE, kernels.LIFT, 1e4
+    vertices = vertices.double()
+    normals = surface.vertex_normals(vertices, faces)
+    middle = (vertices.amin(0) + vertices.amax(0)) / 2
+    radius = kernels.MARGIN * (vertices - middle).norm(dim=1).max()
+    K = torch.tensor([[far * size / 2, 0, size / 2], [0, far * size / 2, size / 2], [0, 0, 1]]).to(vertices)
+    seen, whole = vertices.new_zeros(2, len(vertices), 4)
+    for direction, weight, axes, light in zip(*sky, radiance, strict=True):
+        viewmat = torch.eye(4).to(vertices)
+        viewmat[:3, :3] = axes
+        viewmat[:3, 3] = -axes.double() @ middle
+        viewmat[2, 3] += far * radius
+        depth = depth_map(vertices, faces, viewmat, K, size, size, outputs=("depth",)).depth
+        cosine = normals @ direction.double()
+        points = (vertices + lift * normals) @ viewmat[:3, :3].T + viewmat[:3, 3]
+        place = (points[:, :2] / points[:, 2:]) * K[0, 0] + size / 2 - 0.5
+        corner = place.floor()
+        tangent = (1 - cosine.square()).clamp_min(0).sqrt() / cosine
+        bias = lift + tangent.clamp(max=kernels.STEEPEST) * 2 * radius / size
+        share = torch.zeros_like(cosine)
+        for column, row in itertools.product((0, 1), (0, 1)):
+            at = (corner + corner.new_tensor([column, row])).clamp(0, size - 1).long()
+            gap = depth[at[:, 1], at[:, 0]] + bias - points[:, 2]
+            weights = (1 - (place - corner - place.new_tensor([column, row])).abs()).prod(1)
+            share += weights * (gap / lift + 1).clamp(0, 1)
+        arriving = weight * cosine.clamp_min(0)[:, None] * torch.cat([light.new_ones(1), light])
+        whole += arriving
+        seen += torch.where(arriving > 0, arriving * share[:, None], arriving)
+    return smooth_over_faces((seen / whole).float()[None], faces)[0]
+
+
+def test_each_pair_of_directions_is_drawn_at_once_as_depth_maps_draw_both(ball_by_wall):
+    """Nearest and farthest depths are of one drawing: a sign, or a buffer, could be that of the other side."""
+    (vertices, faces), _ = ball_by_wall
+    radiance = torch.rand(N_DIRECTIONS, 3, generator=torch.Generator().manual_seed(0)).to(vertices)
+    own, expected = exposed([(vertices, faces)], radiance[None])[0], exposed_by_depth_maps(vertices, faces, radiance)
+    off = (own - expected).abs()
+    assert float(off.mean()) < 1e-3 and float(off.max()) < 0.05  # pixels on an edge of the surface
 
 
 def test_light_that_never_reaches_a_side_is_not_hidden_there(ball):

@@ -264,12 +264,27 @@ def contacts(
 
 
 @wp.kernel
+def moving(
+    first: int,
+    others: wp.array2d[wp.int32],  # of `find`
+    offsets: wp.array[wp.int32],  # rows of neighbours
+    neighbours: wp.array[wp.int32],
+    out: wp.array2d[wp.int32],  # 1 where a vertex or one of its neighbours has another; 0 before
+):
+    i = first + wp.tid()
+    b = i // others.shape[1]
+    v = i - b * others.shape[1]
+    if others[b, v] >= 0:
+        for e in range(offsets[v], offsets[v + 1]):
+            out[b, neighbours[e]] = 1  # whichever thread writes it
+
+
+@wp.kernel
 def spread(
     first: int,
     wanted: wp.array2d[wp.vec4f],  # of `contacts`
     shifts: wp.array2d[wp.vec3f],
-    part: wp.array[wp.int32],
-    state: wp.array2d[wp.int32],
+    moving: wp.array2d[wp.int32],  # of `moving`
     offsets: wp.array[wp.int32],
     neighbours: wp.array[wp.int32],
     weights: wp.array[wp.float32],  # of neighbours
@@ -281,7 +296,7 @@ def spread(
     b = i // wanted.shape[1]
     v = i - b * wanted.shape[1]
     moved = shifts[b, v]
-    if state[b, part[v]] > 0:
+    if moving[b, v] > 0:
         total = wp.vec3f()
         share = wp.float32(0.0)
         for e in range(offsets[v], offsets[v + 1]):

@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 
 from oasis_warp.core import rotation, surface
 from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.surface import Corners, read_at
 from oasis_warp.core.types import CanonicalGaussians, PosedHand
 
 VERTEX_SPREAD = 0.75
@@ -175,11 +176,21 @@ def vertex_colors(gaussians: CanonicalGaussians, n_vertices: int) -> Float[Tenso
     return own.mean(0).repeat(n_vertices, 1).index_copy(0, gaussians.vertex_index, own)
 
 
+def gaussian_corners(faces: Int[Tensor, "F 3"], anchors: Anchors | CanonicalGaussians) -> Corners:
+    """Vertices and weights with which `vertex_to_gaussians` reads a field at every Gaussian."""
+    own = anchors.vertex_index[:, None].expand(-1, 3)
+    whole = torch.eye(3, dtype=anchors.barycentrics.dtype, device=own.device)[:1].expand(len(own), 3)
+    index = torch.cat([own, faces.index_select(0, anchors.face_index)]).int()
+    return Corners(index, torch.cat([whole, anchors.barycentrics]))
+
+
 def vertex_to_gaussians(
     values: Float[Tensor, "V D"], faces: Int[Tensor, "F 3"], anchors: Anchors | CanonicalGaussians
 ) -> Float[Tensor, "N D"]:
     """A field over the vertices, read at every Gaussian."""
-    # index_select and not values[...]: its gradient adds in a fixed order, so equal seeds give equal bits
+    if not (values.requires_grad and torch.is_grad_enabled()):
+        return read_at(values, gaussian_corners(faces, anchors))
+    # The gradient of index_select takes a quarter of embedding_bag's time, and adds in a fixed order, too.
     return torch.cat([values.index_select(0, anchors.vertex_index), _at_face_gaussians(values, faces, anchors)])
 
 
@@ -191,12 +202,3 @@ def _at_face_gaussians(
         for k in range(3)
     )
     return first + second + third
-
-
-def gaussian_corners(
-    faces: Int[Tensor, "F 3"], anchors: Anchors | CanonicalGaussians
-) -> tuple[Int[Tensor, "N 3"], Float[Tensor, "N 3"]]:
-    """Vertices and weights with which `vertex_to_gaussians` reads a field at every Gaussian."""
-    own = anchors.vertex_index[:, None].expand(-1, 3)
-    whole = torch.eye(3, dtype=anchors.barycentrics.dtype, device=own.device)[:1].expand(len(own), 3)
-    return torch.cat([own, faces[anchors.face_index]]).long(), torch.cat([whole, anchors.barycentrics])

@@ -18,6 +18,7 @@ from oasis_warp.avatar.folds import LEAST, MIN_COLOR, Folds, beyond_shallow, edg
 from oasis_warp.avatar.sky import sky_mesh
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.surface import Corners, read_at
 from oasis_warp.core.types import CanonicalGaussians
 
 PASSES = 60
@@ -36,10 +37,8 @@ class Creases(NamedTuple):
 
     index: Int[Tensor, "M"]
     """Their numbers among all."""
-    corners: Int[Tensor, "M 3"]
+    corners: Corners
     """Vertices around each."""
-    weights: Float[Tensor, "M 3"]
-    """Theirs."""
     change: Float[Tensor, "M 3"]
     """Added to the logarithms of their colours where skin is wholly stretched."""
     areas: Float[Tensor, "C"]
@@ -74,9 +73,9 @@ def find_creases(
     read = vertex_to_gaussians(beside.index_copy(0, vertex, fields), hand.faces, gaussians)
     index = torch.nonzero(read[:, 3].index_fill(0, folds.index, 0) > LEAST)[:, 0]
     beyond = gaussians.colors[index].clamp_min(MIN_COLOR).log() - read[index, :3]
-    corners, weights = gaussian_corners(hand.faces, gaussians)
+    corners = Corners(*(part[index] for part in gaussian_corners(hand.faces, gaussians)))
     change = -beyond_shallow(beyond, SHALLOW) * read[index, 3:]
-    return Creases(index, corners[index], weights[index], change, _coarse_areas(photo))
+    return Creases(index, corners, change, _coarse_areas(photo))
 
 
 @functools.lru_cache(4)
@@ -91,8 +90,7 @@ def _palm_skin(hand: HandModel) -> tuple[Int[Tensor, "S"], Int[Tensor, "E 2"], F
 @torch.no_grad()
 def flat_creases(creases: Creases, posed: Float[Tensor, "*B V 3"]) -> Float[Tensor, "*B M 3"]:
     """What a posed surface [m] adds to the logarithms of the colours of creases."""
-    share = flat_share(creases, posed)[..., creases.corners] * creases.weights
-    return share.sum(-1, keepdim=True) * creases.change
+    return read_at(flat_share(creases, posed)[..., None], creases.corners) * creases.change
 
 
 @torch.no_grad()
@@ -100,7 +98,7 @@ def flat_share(creases: Creases, posed: Float[Tensor, "*B V 3"]) -> Float[Tensor
     """How flat creases are at the vertices of a posed surface [m], 0 to 1."""
     mesh = sky_mesh(posed.device)
     grown = (_coarse_areas(posed) / creases.areas).log()
-    grown = (grown[..., mesh.corners] * mesh.weights.to(grown)).sum(-1)
+    grown = read_at(grown[..., None], mesh.corners)[..., 0]
     return ((grown - AS_IN_PHOTO) / (STRETCHED - AS_IN_PHOTO)).clamp(0, 1)
 
 

@@ -7,12 +7,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from oasis_warp.avatar.anchors import vertex_to_gaussians
+from oasis_warp.avatar.anchors import gaussian_corners
 from oasis_warp.avatar.creases import Creases, flat_creases
 from oasis_warp.avatar.folds import Opening
 from oasis_warp.avatar.sky import arriving, arriving_before, exposure, harmonic_basis, in_crevices, largest_nearby
 from oasis_warp.core import rotation, surface
 from oasis_warp.core.mirror import mirror_light, mirror_points
+from oasis_warp.core.surface import Corners, read_at
 from oasis_warp.core.types import CanonicalGaussians, Gaussians, HandLight
 from oasis_warp.ops import RestMesh, face_rotations, pose_mesh_gaussians
 from oasis_warp.ops.sky_exposure import sky_directions
@@ -62,6 +63,8 @@ class SurfaceLight(NamedTuple):
     """Share of the sky that each vertex saw in the photo; None where no shade depends on it."""
     photo_view: Float[Tensor, "3"] | None = None
     """Unit direction from the middle of the hand to the photo's camera; None where the view changes no colour."""
+    corners: Corners | None = None
+    """Of the surface's Gaussians, if they are known."""
 
 
 class Lighting(NamedTuple):
@@ -191,23 +194,26 @@ def shading_factors(
     seen: Float[Tensor, "V"] | None = None,
     viewed: Float[Tensor, "*B"] | None = None,
     opening: Opening | None = None,
+    corners: Corners | None = None,
 ) -> Float[Tensor, "*B N 3"]:
     """Factors by which `light`, and the `opening` of folds, multiply the colours of Gaussians.
 
     Without `seen` those in the photo itself; `viewed` is the `view_share`, 1 if not given. Painted folds are as in
-    the photo as far as its weak shade stays.
+    the photo as far as its weak shade stays. The `corners` are those of all Gaussians, found if not given.
     """
+    if corners is None:
+        corners = gaussian_corners(faces, canonical)
     of_vertices = shading(light, on)
     if light.facing is None:
-        return _opened(_at_gaussians(of_vertices, faces, canonical), opening)
+        return _opened(read_at(of_vertices, corners), opening)
     stays = remaining_shade(light, on, seen)
     if viewed is not None:
         stays = stays * viewed[..., None, None]
     if light.shade is not None:  # all of it is smooth, or of pixels beside outlines
         of_vertices = of_vertices * (1 + stays[..., :1] * (light.shade - 1))
     if canonical.shade is None and opening is None:
-        return _at_gaussians(of_vertices, faces, canonical)
-    read = _at_gaussians(torch.cat([of_vertices, stays], -1), faces, canonical)
+        return read_at(of_vertices, corners)
+    read = read_at(torch.cat([of_vertices, stays], -1), corners)
     of_deep, of_weak = read[..., 3:4], read[..., 4:]
     factors = _opened(read[..., :3], opening, of_weak)
     if canonical.shade is None:
@@ -232,15 +238,6 @@ def _times_exp(
     factors: Float[Tensor, "*B N 3"], index: Int[Tensor, "M"], logs: Float[Tensor, "*B M 3"]
 ) -> Float[Tensor, "*B N 3"]:
     return factors.index_copy(-2, index, factors.index_select(-2, index) * logs.exp())
-
-
-def _at_gaussians(
-    of_vertices: Float[Tensor, "*B V D"], faces: Int[Tensor, "F 3"], canonical: CanonicalGaussians
-) -> Float[Tensor, "*B N D"]:
-    if of_vertices.ndim == 2:
-        return vertex_to_gaussians(of_vertices, faces, canonical)
-    of_poses = vertex_to_gaussians(of_vertices.movedim(0, 1).flatten(1), faces, canonical)
-    return of_poses.unflatten(1, (-1, of_vertices.shape[-1])).movedim(1, 0)
 
 
 def in_even_light(canonical: CanonicalGaussians, light: HandLight) -> CanonicalGaussians:
@@ -332,7 +329,7 @@ def pose_gaussians(
         viewed = None
         if center is not None and light.photo_view is not None:
             viewed = view_share(light.photo_view, view_direction(posed_vertices, center))
-        factors = shading_factors(canonical, faces, light.light, on, light.seen, viewed, opening)
+        factors = shading_factors(canonical, faces, light.light, on, light.seen, viewed, opening, light.corners)
         if creases is not None:
             factors = _times_exp(factors, creases.index, flat_creases(creases, posed_vertices))
         colors = (colors * factors).clamp(0, 1)

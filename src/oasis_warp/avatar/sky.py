@@ -7,12 +7,13 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy import sparse
 from torch import Tensor
-from torch.nn.functional import pad
 
 from oasis_warp.assets import asset
 from oasis_warp.core import rotation, surface
 from oasis_warp.core.color import LUMINANCE
+from oasis_warp.core.surface import Corners, read_at
 from oasis_warp.core.types import HandLight
 from oasis_warp.ops.sky_exposure import sky_directions, sky_exposure
 
@@ -49,12 +50,12 @@ class SkyMesh(NamedTuple):
     """Numbers of the hand's vertices that it keeps."""
     faces: Int[Tensor, "G 3"]
     """Between these."""
-    corners: Int[Tensor, "V 3"]
-    """Corners of the coarse face that lies nearest to each vertex of the hand."""
-    weights: Float[Tensor, "V 3"]
-    """With which that vertex reads them."""
+    corners: Corners
+    """Of the coarse face that lies nearest to each vertex of the hand."""
     vertex_faces: Int[Tensor, "C M"]
     """The coarse faces around each coarse vertex, as `core.surface.faces_of_vertices`."""
+    nearby: Int[Tensor, "C N"]
+    """The coarse vertices within `NEARBY` rings of each, itself among them; the last also fills a row up."""
     still: int
     """The vertex that moves most with the wrist alone."""
 
@@ -68,22 +69,29 @@ def sky_mesh(device: torch.device) -> SkyMesh:
         asset("hand", "sky_mesh.npz").open("rb") as file,
         np.load(file, allow_pickle=False) as stored,
     ):
-        vertices, faces, corners = (
-            torch.from_numpy(stored[name].astype(np.int64)).to(device) for name in ("vertices", "faces", "corners")
-        )
+        table = {name: stored[name].astype(np.int64) for name in ("vertices", "faces", "corners")}
+        table["nearby"] = _within_rings(table["faces"], len(table["vertices"])).astype(np.int64)
+        vertices, faces, corners, nearby = (torch.from_numpy(part).to(device) for part in table.values())
         weights = torch.from_numpy(stored["weights"].astype(np.float32)).to(device)
+        read = Corners(corners.int(), weights)
         vertex_faces = surface.faces_of_vertices(faces, len(vertices))
-        return SkyMesh(vertices, faces, corners, weights, vertex_faces, int(stored["still"]))
+        return SkyMesh(vertices, faces, read, vertex_faces, nearby, int(stored["still"]))
+
+
+def _within_rings(faces: np.ndarray, count: int) -> np.ndarray:
+    """Vertices within `NEARBY` rings of each of `count` vertices; the last of a row also fills it up."""
+    rows, columns = (np.repeat(faces, 3, axis=1).ravel(), np.tile(faces, 3).ravel())
+    beside = sparse.csr_array((np.ones(len(rows)), (rows, columns)), (count, count))
+    near = sparse.csr_array(sparse.linalg.matrix_power(beside, NEARBY))
+    sizes = np.diff(near.indptr)
+    return near.indices[near.indptr[:-1, None] + np.minimum(np.arange(sizes.max()), sizes[:, None] - 1)]
 
 
 def largest_nearby(values: Float[Tensor, "*B V"]) -> Float[Tensor, "*B V"]:
-    """The largest of `values`, none below 0, over `NEARBY` rings of coarse faces around each vertex."""
+    """The largest of `values` over `NEARBY` rings of coarse faces around each vertex."""
     mesh = sky_mesh(values.device)
-    coarse = values[..., mesh.vertices]
-    for _ in range(NEARBY):
-        on_faces = pad(coarse[..., mesh.faces].amax(-1), (0, 1))  # a zero past the last face
-        coarse = on_faces[..., mesh.vertex_faces].amax(-1)
-    return (coarse[..., mesh.corners] * mesh.weights.to(values)).sum(-1)
+    coarse = values[..., mesh.vertices][..., mesh.nearby].amax(-1)
+    return read_at(coarse[..., None], mesh.corners)[..., 0]
 
 
 def harmonic_basis(directions: Float[Tensor, "*B 3"], count: int) -> Float[Tensor, "*B K"]:
@@ -126,7 +134,7 @@ def exposure(
     coarse = posed[..., mesh.vertices, :].float().reshape(-1, len(mesh.vertices), 3)
     facing = normals[..., mesh.vertices, :].float().reshape(coarse.shape)
     found = sky_exposure(coarse, facing, mesh.faces, frames, radiance(light, directions.to(light.harmonics)).float())
-    return (found[:, mesh.corners] * mesh.weights[..., None]).sum(-2).to(posed).reshape(*batch, -1, 4)
+    return read_at(found, mesh.corners).to(posed).reshape(*batch, -1, 4)
 
 
 def bounced(exposure: Float[Tensor, "*B 3"], albedo: Float[Tensor, "3"]) -> Float[Tensor, "*B 3"]:

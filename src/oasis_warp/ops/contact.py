@@ -159,6 +159,8 @@ def _contact_on_cpu(
     launch_ranges(kernels.normals, batch * n, [points, *index, t.part, state, outward, normals], vertices)
     given = [points, normals, t.members, t.starts, t.part, corners, met, state, DEEPEST, OPPOSED, others]
     launch_ranges(kernels.find, batch * n, given, vertices)
+    moving = torch.zeros_like(others)
+    launch_ranges(kernels.moving, batch * n, [others, *around, moving], vertices)
     shifts, wanted = empty(n, 3).zero_(), empty(n, 4)
     for k in range(ROUNDS):
         before, after, leads = vectors(shifts, 2), empty(n, 3), vectors(wanted, 2)
@@ -166,7 +168,7 @@ def _contact_on_cpu(
         launch_ranges(kernels.contacts, batch * n, given, vertices)
         if k == 0 and not wanted[..., 3].any():
             return None
-        given = [leads, before, t.part, state, *around, t.weights, t.give, FADES, vectors(after, 2)]
+        given = [leads, before, moving, *around, t.weights, t.give, FADES, vectors(after, 2)]
         launch_ranges(kernels.spread, batch * n, given, vertices)
         shifts = after
     if share is not None:

@@ -5,29 +5,16 @@ import math
 from typing import NamedTuple
 
 import torch
-import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from oasis_kernels.scene import sky_exposure as kernels
 from oasis_warp.ops._runtime.declaration import Array, Declaration
-from oasis_warp.ops._runtime.launch import launch_ranges, vectors, view
-from oasis_warp.ops.depth_map import depth_map
-from oasis_warp.ops.smoothing import smooth_over_faces
+from oasis_warp.ops._runtime.incidence import incidence
+from oasis_warp.ops._runtime.launch import block_count, contiguous, current_stream, phase_state, run_cuda, run_native
 
-N_DIRECTIONS = 32
+N_DIRECTIONS = 2 * kernels.PAIRS
 """Number of `sky_directions`."""
-SIZE = 64
-"""Side of the depth buffers [px]: 3 mm of a hand's 20 cm."""
-DISTANCE = 50.0
-"""Distance of their cameras, in radii of the surface: the rays are nearly parallel."""
-MARGIN = 1.03
-"""Radius that a buffer shows, in radii of the surface."""
-FOCAL = DISTANCE * SIZE / 2
-MIN_TASKS = 256
-"""Vertices for which another thread is worth its while."""
-LIFT = 0.002
-"""Distance off the surface from which points look, and length of the ramp from seen to hidden [m]."""
 
 
 class Sky(NamedTuple):
@@ -98,38 +85,49 @@ def sky_exposure(
     Raises:
         ValueError: a wrong shape, type or index.
     """
-    sky = sky_directions(vertices.device)
     sizes = _SKY_EXPOSURE.check(
         {"D": N_DIRECTIONS}, vertices=vertices, normals=normals, faces=faces, frames=frames, radiance=radiance
     )
-    batch, n = sizes["B"], N_DIRECTIONS
-    own = vertices @ frames  # in axes that turn with the surface
-    middle = (own.amin(1) + own.amax(1)) / 2
-    radius = MARGIN * (own - middle[:, None]).norm(dim=-1).amax(1)
-    center = (frames @ middle[..., None])[..., 0]
-    views = torch.zeros(batch, n, 4, 4, device=vertices.device)
-    views[..., :3, :3] = axes = sky.axes @ frames.mT[:, None]
-    views[..., :3, 3] = -(axes @ center[:, None, :, None])[..., 0]
-    views[..., 2, 3] += DISTANCE * radius[:, None]
-    views[..., 3, 3] = 1
-    seen = depth_map(
-        vertices[:, None].expand(-1, n, -1, -1).flatten(0, 1), faces, views.flatten(0, 1), _intrinsics(vertices.device),
-        SIZE, SIZE, outputs=("depth",), validate=False,
-    )  # fmt: skip
-    directions = (sky.directions @ frames.mT).contiguous()
-    out = vertices.new_empty(batch, sizes["V"], 4)
-    inputs = [
-        vectors(vertices.contiguous(), 2), vectors(normals.contiguous(), 2), vectors(directions, 2), sky.weights,
-        vectors(radiance.contiguous(), 2), view(views, wp.mat44f), FOCAL, (radius * (2 / SIZE)).contiguous(),
-        seen.depth.unflatten(0, (batch, n)), LIFT, vectors(out, 2),
-    ]  # fmt: skip
-    count = batch * sizes["V"]
-    parts = max(1, min(torch.get_num_threads(), count // MIN_TASKS))
-    launch_ranges(kernels.sky_exposure, [count * k // parts for k in range(parts + 1)], inputs, like=vertices)
-    return smooth_over_faces(out, faces)
+    batch, n, n_pairs = sizes["B"], sizes["V"], kernels.PAIRS
+    index, pairs = incidence("faces", faces, n, "vertices"), _pairs(vertices.device)
+    vertices, normals, frames, radiance = contiguous(vertices, normals, frames, radiance)
+    params = pairs._asdict() | {
+        "batch": batch, "n_vertices": n, "n_faces": len(faces), "vertices": vertices, "normals": normals,
+        "faces": index.table, "offsets": index.offsets, "entries": index.entries, "frames": frames,
+        "radiance": radiance, "radius": vertices.new_empty(batch), "rough": vertices.new_empty(batch, n, 4),
+        "out": vertices.new_empty(batch, n, 4),
+    }  # fmt: skip
+    if vertices.is_cuda:
+        size, stream = kernels.SIZE, current_stream(vertices.device)
+        params["middle"] = vertices.new_empty(batch, 3)
+        params["buffers"] = vertices.new_empty(batch, n_pairs, 2, size, size)
+        run_cuda(kernels.draw, params, batch * n_pairs if n else 0, stream)
+        run_cuda(kernels.gather, params, block_count(batch * n * n_pairs, kernels.VERTEX_BLOCK), stream)
+        run_cuda(kernels.smooth, params, block_count(batch * n, kernels.VERTEX_BLOCK), stream)
+        return params["out"]
+    width = -(-n // 16) * 16
+    scratch = vertices.new_empty(batch, 6 + 4 * n_pairs, width)
+    own, screen, shares = scratch.flatten().split([batch * rows * width for rows in (6, 3 * n_pairs, n_pairs)])
+    params |= {"state": phase_state(kernels.STATE), "width": width, "own": own, "screen": screen, "shares": shares}
+    run_native(kernels.expose, params, batch * n_pairs if n else 0)
+    return params["out"]
+
+
+class _Pairs(NamedTuple):
+    """Opposite directions of the sky."""
+
+    pairs: Int[Tensor, "P 2"]
+    """Their numbers, int32."""
+    axes: Float[Tensor, "P 3 3"]
+    """Of the first."""
+    weights: Float[Tensor, "P"]
+    """Of either."""
 
 
 @functools.cache
-def _intrinsics(device: torch.device) -> Float[Tensor, "3 3"]:
-    """Intrinsics of the buffers' cameras; kept, because a graph must not copy them from the host."""
-    return torch.tensor([[FOCAL, 0, SIZE / 2], [0, FOCAL, SIZE / 2], [0, 0, 1]], device=device)
+def _pairs(device: torch.device) -> _Pairs:
+    sky = sky_directions(torch.device("cpu"))
+    opposite = torch.cdist(sky.directions, -sky.directions).argmin(1)
+    first = torch.nonzero(torch.arange(N_DIRECTIONS) < opposite)[:, 0]
+    pairs = torch.stack([first, opposite[first]], 1).int()
+    return _Pairs(*(part.contiguous().to(device) for part in (pairs, sky.axes[first], sky.weights[first])))

@@ -3,7 +3,6 @@
 "use strict";
 
 const BUFFER = 64; // side of a depth buffer [px]
-const FAR = 50; // distance of the cameras, in radii of the surface
 const MARGIN = 1.03; // radius that a buffer shows, in radii of the surface
 const LIFT = 0.002; // off the surface from which points look, and length of the ramp from seen to hidden [m]
 const STEEPEST = 3; // tangent up to which depth may differ by a texel's slope
@@ -97,15 +96,14 @@ function radiance(harmonics, d) {
 
 const harmonicBasis = (x, y, z) => [1, x, y, z, x * y, y * z, 3 * z * z - 1, x * z, x * x - y * y];
 
-// The nearest surface at the centre of each pixel, seen from far out that way.
+// The nearest surface at the centre of each pixel, as parallel rays from that way see it.
 function drawDepth(sky, axes, middle, radius, faces) {
-  const { own, screen, depth, count } = sky, focal = (FAR * BUFFER) / 2;
+  const { own, screen, depth, count } = sky, scale = BUFFER / (2 * radius);
   for (let i = 0; i < count; i++) {
     const x = own[3 * i] - middle[0], y = own[3 * i + 1] - middle[1], z = own[3 * i + 2] - middle[2];
-    const far = axes[6] * x + axes[7] * y + axes[8] * z + FAR * radius;
-    screen[3 * i] = (focal * (axes[0] * x + axes[1] * y + axes[2] * z)) / far + BUFFER / 2 - 0.5;
-    screen[3 * i + 1] = (focal * (axes[3] * x + axes[4] * y + axes[5] * z)) / far + BUFFER / 2 - 0.5;
-    screen[3 * i + 2] = far;
+    screen[3 * i] = scale * (axes[0] * x + axes[1] * y + axes[2] * z) + BUFFER / 2 - 0.5;
+    screen[3 * i + 1] = scale * (axes[3] * x + axes[4] * y + axes[5] * z) + BUFFER / 2 - 0.5;
+    screen[3 * i + 2] = axes[6] * x + axes[7] * y + axes[8] * z;
   }
   depth.fill(Infinity);
   for (let f = 0; f < faces.length; f += 3) {
@@ -131,16 +129,16 @@ function drawDepth(sky, axes, middle, radius, faces) {
 
 // How much of one direction each vertex sees: percentage-closer filtered, four texels, each with a ramp.
 function findShares(sky, toSky, axes, middle, radius, shares) {
-  const { own, normals, depth, count } = sky, focal = (FAR * BUFFER) / 2, texel = (2 * radius) / BUFFER;
+  const { own, normals, depth, count } = sky, texel = (2 * radius) / BUFFER, scale = 1 / texel;
   for (let i = 0; i < count; i++) {
     const nx = normals[3 * i], ny = normals[3 * i + 1], nz = normals[3 * i + 2];
     const cosine = nx * toSky[0] + ny * toSky[1] + nz * toSky[2];
     if (cosine <= 0) continue;
     const px = own[3 * i] + LIFT * nx - middle[0], py = own[3 * i + 1] + LIFT * ny - middle[1];
     const pz = own[3 * i + 2] + LIFT * nz - middle[2];
-    const far = axes[6] * px + axes[7] * py + axes[8] * pz + FAR * radius;
-    const x = (focal * (axes[0] * px + axes[1] * py + axes[2] * pz)) / far + BUFFER / 2 - 0.5;
-    const y = (focal * (axes[3] * px + axes[4] * py + axes[5] * pz)) / far + BUFFER / 2 - 0.5;
+    const x = scale * (axes[0] * px + axes[1] * py + axes[2] * pz) + BUFFER / 2 - 0.5;
+    const y = scale * (axes[3] * px + axes[4] * py + axes[5] * pz) + BUFFER / 2 - 0.5;
+    const far = axes[6] * px + axes[7] * py + axes[8] * pz;
     const steep = Math.min(Math.sqrt(Math.max(1 - cosine * cosine, 0)) / cosine, STEEPEST);
     const limit = LIFT + steep * texel - far, left = Math.floor(x), top = Math.floor(y), u = x - left, v = y - top;
     let share = 0;
