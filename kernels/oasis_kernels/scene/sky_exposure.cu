@@ -111,8 +111,8 @@ __global__ void gather(
     const float* middle,  // [B, 3], from `draw`
     const float* buffers  // [B, P, 2, SIZE, SIZE], from `draw`
 ) {
-    const long long thread = (long long)block_index * BLOCK + threadIdx.x, i = thread / PAIRS;
-    const int k = (int)(thread % PAIRS);
+    const long long i = (long long)block_index * (BLOCK / PAIRS) + threadIdx.x / PAIRS;
+    const int k = threadIdx.x % PAIRS;
     const bool there = i < (long long)batch * n_vertices;
     float sums[8] = {0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f};  // seen, then all
     if (there) {

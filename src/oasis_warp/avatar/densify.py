@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
+from torch.nn.functional import embedding_bag
 
 from oasis_warp.avatar.anchors import (
     FACE_SPREAD,
@@ -206,13 +207,13 @@ def read_at(
     centers = centers_at_rest(gaussians, vertices, faces)
     tree = cKDTree(centers.detach().cpu().double().numpy())
     count = min(NEIGHBOURS, len(centers))
-    _, near = tree.query(points.detach().cpu().double().numpy(), count, workers=kernel_threads())
-    near = torch.from_numpy(np.asarray(near)).to(points.device).view(len(points), count)
+    found = tree.query(points.detach().cpu().double().numpy(), count, workers=kernel_threads())
+    far, near = (torch.from_numpy(np.asarray(part)).to(points.device).view(len(points), count) for part in found)
     # Along the surface only: a point of it may lie off a flat Gaussian's plane and still be under it.
-    spread = gaussians.scales[:, :2].prod(1).sqrt()
-    apart = (points[:, None] - centers[near]).square().sum(-1) / spread[near].square()
+    apart = far.to(points).square() / gaussians.scales[:, :2].prod(1)[near]
     weight = torch.softmax(-0.5 * apart, 1) * gaussians.opacities[near]
-    return (weight[..., None] * values[near]).sum(1) / weight.sum(1, keepdim=True).clamp_min(1e-12)
+    weight = weight / weight.sum(1, keepdim=True).clamp_min(1e-12)
+    return embedding_bag(near, values, per_sample_weights=weight.to(values), mode="sum")
 
 
 COARSE_SPREAD = 1.6
