@@ -6,6 +6,7 @@ Fills docs/avatar.md (lit-pose). The ways take turns in one run; on CUDA each is
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 
@@ -26,6 +27,8 @@ GROUPS, SECONDS = 40, 8.0
 @dataclass(frozen=True, kw_only=True)
 class Options(AvatarOptions):
     """Options of this study."""
+
+    selecting: ClassVar[frozenset[str]] = frozenset({"device", "poses"})
 
     threads: int | None = 2
     photo: Path = PHOTOS / "palm_flat_right_03.jpg"

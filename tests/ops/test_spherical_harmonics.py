@@ -10,11 +10,12 @@ from rasterization_scenes import ordinary_scene
 from scipy.special import sph_harm_y
 
 from oasis_kernels.scene import sky_exposure as kernels
+from oasis_warp.avatar.sky import harmonic_basis
 from oasis_warp.core import rotation, surface
 from oasis_warp.core.mirror import mirror_points
 from oasis_warp.ops import rasterization, spherical_harmonics
 from oasis_warp.ops.depth_map import depth_map
-from oasis_warp.ops.sky_exposure import N_DIRECTIONS, sky_directions, sky_exposure
+from oasis_warp.ops.sky_exposure import sky_directions, sky_exposure
 from oasis_warp.ops.smoothing import smooth_over_faces
 from oasis_warp.ops.spherical_harmonics import sh_to_rgb
 from oasis_warp.reference import rasterization as reference
@@ -201,15 +202,21 @@ def test_colours_that_are_no_numbers_stay_so(device):
 HALF_TURN = rotation.from_axis_angle(torch.tensor([0.0, 1.0, 0.0]), torch.tensor(torch.pi))
 
 
-def exposed(meshes, radiance=None, frames=None):
+def light(even, x=0.0):
+    """Harmonics of a grey light, and of its change along x."""
+    harmonics = torch.zeros(9, 3)
+    harmonics[0], harmonics[1] = even, x
+    return harmonics
+
+
+def exposed(meshes, radiance=None, turns=None):
     """Of [B] meshes with one topology; under light that is even, unless given."""
     vertices = torch.stack([vertices for vertices, _ in meshes])
     faces = meshes[0][1]
     normals = torch.stack([surface.vertex_normals(own, faces) for own in vertices])
-    n = len(sky_directions(vertices.device).directions)
-    radiance = vertices.new_ones(len(vertices), n, 3) if radiance is None else radiance
-    frames = torch.eye(3, device=vertices.device).expand(len(vertices), 3, 3) if frames is None else frames
-    return sky_exposure(vertices, normals, faces, frames, radiance)
+    radiance = (light(1.0) if radiance is None else radiance).to(vertices)
+    turns = vertices.new_tensor([[1.0, 0, 0, 0]]).expand(len(vertices), 4) if turns is None else turns.to(vertices)
+    return sky_exposure(vertices, normals, faces, turns, radiance)
 
 
 def mesh(made, device):
@@ -253,10 +260,9 @@ def test_a_ball_hides_nothing_from_itself(ball):
 
 def test_a_wall_hides_the_half_of_the_sky_that_lies_behind_it(ball_by_wall):
     (vertices, faces), n = ball_by_wall
-    directions = sky_directions(vertices.device).directions
-    from_wall = (directions[:, :1] > 0.3).float().repeat(1, 3)
-    from_wall[:, 1] = 1 - from_wall[:, 1]
-    found = exposed([(vertices, faces)], from_wall[None])[0, :n]
+    from_wall = light(0.0, 1.0)
+    from_wall[:, 1] *= -1  # green light comes from the other side
+    found = exposed([(vertices, faces)], from_wall)[0, :n]
     towards, away = vertices[:n, 0] > 0.028, vertices[:n, 0] < -0.028
     even, red, green, blue = found[towards].mean(0)
     assert float(even) < 0.35 and float(red) < 0.25 and float(green) > 0.5
@@ -269,7 +275,7 @@ def test_nothing_changes_when_surface_and_directions_turn_together(ball_by_wall)
     (vertices, faces), n = ball_by_wall
     turn = HALF_TURN.to(vertices) @ rotation.from_axis_angle(torch.tensor([1.0, 0, 0]), torch.tensor(0.4)).to(vertices)
     rotated = vertices @ turn.T + 0.3, faces
-    still, moved = exposed([(vertices, faces)]), exposed([rotated], frames=turn[None])
+    still, moved = exposed([(vertices, faces)]), exposed([rotated], turns=rotation.from_matrix(turn[None]))
     torch.testing.assert_close(moved[0, :n], still[0, :n], atol=0.02, rtol=0)
 
 
@@ -300,7 +306,8 @@ def exposed_by_depth_maps(vertices, faces, radiance):
     radius = kernels.MARGIN * (vertices - middle).norm(dim=1).max()
     K = torch.tensor([[far * size / 2, 0, size / 2], [0, far * size / 2, size / 2], [0, 0, 1]]).to(vertices)
     seen, whole = vertices.new_zeros(2, len(vertices), 4)
-    for direction, weight, axes, light in zip(*sky, radiance, strict=True):
+    for direction, weight, axes in zip(*sky, strict=True):
+        colors = (harmonic_basis(direction.cpu(), 9) @ radiance).clamp_min(0).to(vertices)
         viewmat = torch.eye(4).to(vertices)
         viewmat[:3, :3] = axes
         viewmat[:3, 3] = -axes.double() @ middle
@@ -318,7 +325,7 @@ def exposed_by_depth_maps(vertices, faces, radiance):
             gap = depth[at[:, 1], at[:, 0]] + bias - points[:, 2]
             weights = (1 - (place - corner - place.new_tensor([column, row])).abs()).prod(1)
             share += weights * (gap / lift + 1).clamp(0, 1)
-        arriving = weight * cosine.clamp_min(0)[:, None] * torch.cat([light.new_ones(1), light])
+        arriving = weight * cosine.clamp_min(0)[:, None] * torch.cat([colors.new_ones(1), colors])
         whole += arriving
         seen += torch.where(arriving > 0, arriving * share[:, None], arriving)
     return smooth_over_faces((seen / whole).float()[None], faces)[0]
@@ -327,8 +334,8 @@ def exposed_by_depth_maps(vertices, faces, radiance):
 def test_each_pair_of_directions_is_drawn_at_once_as_depth_maps_draw_both(ball_by_wall):
     """Nearest and farthest depths are of one drawing: a sign, or a buffer, could be that of the other side."""
     (vertices, faces), _ = ball_by_wall
-    radiance = torch.rand(N_DIRECTIONS, 3, generator=torch.Generator().manual_seed(0)).to(vertices)
-    own, expected = exposed([(vertices, faces)], radiance[None])[0], exposed_by_depth_maps(vertices, faces, radiance)
+    radiance = light(1.0) + 0.5 * torch.randn(9, 3, generator=torch.Generator().manual_seed(0))
+    own, expected = exposed([(vertices, faces)], radiance)[0], exposed_by_depth_maps(vertices, faces, radiance)
     off = (own - expected).abs()
     assert float(off.mean()) < 1e-3 and float(off.max()) < 0.05  # pixels on an edge of the surface
 
@@ -336,13 +343,11 @@ def test_each_pair_of_directions_is_drawn_at_once_as_depth_maps_draw_both(ball_b
 def test_light_that_never_reaches_a_side_is_not_hidden_there(ball):
     """0 over 0 made black patches on the far side of a lamp."""
     vertices, faces = ball
-    directions = sky_directions(vertices.device).directions
-    from_left = (directions[:, :1] < -0.9).float().repeat(1, 3)
-    found = exposed([(vertices, faces)], from_left[None])[0]
+    found = exposed([(vertices, faces)], light(-0.9, -1.0))[0]  # from the left alone
     assert float(found[vertices[:, 0] > 0.079].min()) == 1
 
 
 def test_wrong_shapes_are_named(ball, as_shipped):
     vertices, faces = ball
     with pytest.raises(ValueError, match="radiance"):
-        sky_exposure(vertices[None], vertices[None], faces, torch.eye(3)[None], torch.ones(1, 5, 3))
+        sky_exposure(vertices[None], vertices[None], faces, torch.eye(4)[:1], torch.ones(4, 3))

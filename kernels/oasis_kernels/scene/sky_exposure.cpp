@@ -18,6 +18,7 @@ void expose(
 #pragma clang fp contract(fast)
 #include "../posing/vectors.h"
 #include "../runtime/ranges.h"
+#include "sky_light.h"
     typedef int J __attribute__((ext_vector_type(4)));
     const float FAR = 1e30f;
     auto lower = [](V a, V b) -> V { return a < b ? a : b; };
@@ -29,7 +30,10 @@ void expose(
     phase(state, batch, [&](long long b) {
         float* rows[6];
         for (int k = 0; k < 6; k++) rows[k] = own + (6 * b + k) * width;
-        const float* m = frames + 9 * b;
+        float m[9];
+        matrix_of(turns + 4 * b, m);
+        for (int k = 0; k < 2 * PAIRS; k++)
+            light_from(m, axes + 9 * (k / 2) + 6, k % 2 ? 1.f : -1.f, lights + 3 * (2 * PAIRS * b + k));
         auto turned = [&](V3 p) -> V3 {
             return {
                 m[0] * p.x + m[3] * p.y + m[6] * p.z, m[1] * p.x + m[4] * p.y + m[7] * p.z,
@@ -170,11 +174,9 @@ void expose(
             for (int k = 0; k < PAIRS; k++) {
                 const V cosine = -along(axes + 9 * k + 6, a, c, d), arriving = weights[k] * magnitude(cosine);
                 const V share = load(shares + (b * PAIRS + k) * width + i);
-                const float* light[2];
-                for (int j = 0; j < 2; j++) light[j] = radiance + 3 * (b * 2 * PAIRS + pairs[2 * k + j]);
+                const float *light = lights + 6 * (b * PAIRS + k), *opposite = light + 3;
                 for (int j = 0; j < 4; j++) {
-                    const V part =
-                        j ? arriving * (cosine > 0.f ? (V)(light[0][j - 1]) : (V)(light[1][j - 1])) : arriving;
+                    const V part = j ? arriving * (cosine > 0.f ? (V)(light[j - 1]) : (V)(opposite[j - 1])) : arriving;
                     whole[j] += part;
                     seen[j] += share * part;
                 }

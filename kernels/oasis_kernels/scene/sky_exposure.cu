@@ -6,12 +6,17 @@ __global__ void draw(
     float* middle,  // [B, 3], scratch: of the box around the vertices, in the axes that turn with the surface
     float* buffers  // [B, P, 2, SIZE, SIZE], scratch: nearest and farthest depths
 ) {
+#include "sky_light.h"
     __shared__ int nearest[SIZE * SIZE], farthest[SIZE * SIZE];
     __shared__ float reduced[WARPS][6];
     __shared__ float box[6];
     const float FAR = 1e30f;
     const int b = block_index / PAIRS, k = block_index - PAIRS * b, lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
-    const float *m = frames + 9 * b, *points = vertices + 3ll * b * n_vertices;
+    const float* points = vertices + 3ll * b * n_vertices;
+    float m[9];
+    matrix_of(turns + 4 * b, m);
+    if (threadIdx.x < 2)
+        light_from(m, axes + 9 * k + 6, threadIdx.x ? 1.f : -1.f, lights + 3 * (2 * block_index + threadIdx.x));
     // The same order as the depths that they stand for, both ways.
     auto ordered = [](float x) -> int {
         const int bits = __float_as_int(x);
@@ -111,13 +116,16 @@ __global__ void gather(
     const float* middle,  // [B, 3], from `draw`
     const float* buffers  // [B, P, 2, SIZE, SIZE], from `draw`
 ) {
+#include "sky_light.h"
     const long long i = (long long)block_index * (BLOCK / PAIRS) + threadIdx.x / PAIRS;
     const int k = threadIdx.x % PAIRS;
     const bool there = i < (long long)batch * n_vertices;
     float sums[8] = {0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f};  // seen, then all
     if (there) {
         const int b = (int)(i / n_vertices);
-        const float *m = frames + 9 * b, *p = vertices + 3 * i, *n = normals + 3 * i, *axis = axes + 9 * k;
+        const float *p = vertices + 3 * i, *n = normals + 3 * i, *axis = axes + 9 * k;
+        float m[9];
+        matrix_of(turns + 4 * b, m);
         const float texel = radius[b] * (2.f / SIZE), scale = texel > 0.f ? 1.f / texel : 0.f;
         float at[3] = {0.f, 0.f, 0.f}, tilt[3] = {0.f, 0.f, 0.f};  // along the axes
         for (int j = 0; j < 3; j++) {
@@ -144,7 +152,7 @@ __global__ void gather(
             const float weight = (j % 2 ? part_x : 1.f - part_x) * (j / 2 ? part_y : 1.f - part_y);
             share += weight * fminf(fmaxf((gap + bias) * (1.f / LIFT) + 1.f, 0.f), 1.f);
         }
-        const float* light = radiance + 3ll * (2 * PAIRS * b + pairs[2 * k + (cosine > 0.f ? 0 : 1)]);
+        const float* light = lights + 3 * (2 * (b * PAIRS + k) + (cosine > 0.f ? 0 : 1));
         for (int j = 0; j < 4; j++) {
             sums[4 + j] = weights[k] * size * (j ? light[j - 1] : 1.f);
             sums[j] = share * sums[4 + j];

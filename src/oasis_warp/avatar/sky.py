@@ -9,16 +9,19 @@ import torch
 from jaxtyping import Float, Int
 from scipy import sparse
 from torch import Tensor
+from torch.nn.functional import pad
 
 from oasis_warp.assets import asset
-from oasis_warp.core import rotation, surface
+from oasis_warp.core import surface
 from oasis_warp.core.color import LUMINANCE
 from oasis_warp.core.surface import Corners, read_at
 from oasis_warp.core.types import HandLight
-from oasis_warp.ops.sky_exposure import sky_directions, sky_exposure
+from oasis_warp.ops.sky_exposure import sky_exposure
 
 LOBE = (1.0, 2 / 3, 1 / 4)
 """What a cosine lobe leaves of each degree of harmonics (Ramamoorthi and Hanrahan 2001)."""
+DEGREES = (0, 1, 1, 1, 2, 2, 2, 2, 2)
+"""Of the nine functions."""
 
 
 IN_HOLLOWS = (1.0, 1.2, 1.35)
@@ -103,12 +106,16 @@ def harmonic_basis(directions: Float[Tensor, "*B 3"], count: int) -> Float[Tenso
     return torch.cat([first, torch.stack([x * y, y * z, 3 * z * z - 1, x * z, x * x - y * y], -1)], -1)
 
 
-def radiance(light: HandLight, directions: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
-    """The light that comes from unit `directions`: irradiance without the blur of the cosine lobe, never below 0."""
-    count = len(light.harmonics)
-    degrees = [0] + 3 * [1] + 5 * [2]
-    blur = torch.cat([torch.full_like(light.harmonics[:1], LOBE[degree]) for degree in degrees[:count]])
-    return (harmonic_basis(directions, count) @ (light.harmonics / blur)).clamp_min(0)
+def radiance_harmonics(light: HandLight) -> Float[Tensor, "9 3"]:
+    """Harmonics of the light from each direction: those of irradiance without the blur of the cosine lobe."""
+    whole = pad(light.harmonics, (0, 0, 0, 9 - len(light.harmonics)))
+    return whole / _blur(whole.device).to(whole)
+
+
+@functools.cache
+def _blur(device: torch.device) -> Float[Tensor, "9 1"]:
+    with torch.inference_mode(False):
+        return torch.tensor([[LOBE[degree]] for degree in DEGREES], device=device)
 
 
 @torch.no_grad()
@@ -125,15 +132,15 @@ def exposure(
     Args:
         posed: Vertices [m].
         normals: Unit.
-        quats: By which each vertex has turned from rest.
+        quats: Unit, by which each vertex has turned from rest.
         light: Any; what of it does not arrive bounces.
     """
     mesh, batch = sky_mesh(posed.device), posed.shape[:-2]
-    frames = rotation.to_matrix(quats[..., mesh.still, :]).float().reshape(-1, 3, 3)
-    directions = sky_directions(posed.device).directions @ frames.mT
-    coarse = posed[..., mesh.vertices, :].float().reshape(-1, len(mesh.vertices), 3)
-    facing = normals[..., mesh.vertices, :].float().reshape(coarse.shape)
-    found = sky_exposure(coarse, facing, mesh.faces, frames, radiance(light, directions.to(light.harmonics)).float())
+    coarse, facing = (
+        part[..., mesh.vertices, :].float().reshape(-1, len(mesh.vertices), 3) for part in (posed, normals)
+    )
+    turns = quats[..., mesh.still, :].float().reshape(-1, 4)
+    found = sky_exposure(coarse, facing, mesh.faces, turns, radiance_harmonics(light).float())
     return read_at(found, mesh.corners).to(posed).reshape(*batch, -1, 4)
 
 
@@ -177,7 +184,6 @@ def _constants(device: torch.device) -> Float[Tensor, "3 3"]:
         return torch.tensor([LEAST_LIGHT, IN_HOLLOWS, IN_CREVICES], device=device)
 
 
-DEGREES = (0, 1, 1, 1, 2, 2, 2, 2, 2)
 SQUARES = (1, 1 / 3, 1 / 3, 1 / 3, 1 / 15, 1 / 15, 4 / 5, 1 / 15, 4 / 15)
 """Means over the sphere of the squares of the nine functions."""
 STUDIO_FILL = 0.55

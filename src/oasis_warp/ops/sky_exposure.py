@@ -13,9 +13,6 @@ from oasis_warp.ops._runtime.declaration import Array, Declaration
 from oasis_warp.ops._runtime.incidence import incidence
 from oasis_warp.ops._runtime.launch import block_count, contiguous, current_stream, phase_state, run_cuda, run_native
 
-N_DIRECTIONS = 2 * kernels.PAIRS
-"""Number of `sky_directions`."""
-
 
 class Sky(NamedTuple):
     """D directions towards the sky, which hold weighted means over the sphere to degree 9."""
@@ -52,7 +49,7 @@ _SKY_EXPOSURE = Declaration(
     "sky_exposure",
     inputs={
         "vertices": Array("B V 3"), "normals": Array("B V 3"), "faces": Array("F 3", index="V"),
-        "frames": Array("B 3 3"), "radiance": Array("B D 3"),
+        "turns": Array("B 4"), "radiance": Array("H 3"),
     },
     public=False,
 )  # fmt: skip
@@ -63,8 +60,8 @@ def sky_exposure(
     vertices: Float[Tensor, "B V 3"],
     normals: Float[Tensor, "B V 3"],
     faces: Int[Tensor, "F 3"],
-    frames: Float[Tensor, "B 3 3"],
-    radiance: Float[Tensor, "B D 3"],
+    turns: Float[Tensor, "B 4"],
+    radiance: Float[Tensor, "9 3"],
 ) -> Float[Tensor, "B V 4"]:
     """Share of the light from all around that reaches each vertex past the surface itself: 1 where nothing hides.
 
@@ -76,8 +73,8 @@ def sky_exposure(
         vertices: Vertices of posed surfaces [m], float32, [B, V, 3].
         normals: Unit, [B, V, 3].
         faces: Corners, [F, 3].
-        frames: Rotations that turn the directions, [B, 3, 3]: if they turn with the surface, so does the result.
-        radiance: Light L from each turned direction, red, green and blue, not negative, [B, D, 3].
+        turns: Unit quaternions wxyz that turn the directions, [B, 4]; as they turn with a surface, so does the result.
+        radiance: Harmonics of the light L, as in `HandLight.harmonics`, [9, 3]; below 0 there is none.
 
     Returns:
         Shares under an even sky, then of the light's red, green and blue.
@@ -86,15 +83,16 @@ def sky_exposure(
         ValueError: a wrong shape, type or index.
     """
     sizes = _SKY_EXPOSURE.check(
-        {"D": N_DIRECTIONS}, vertices=vertices, normals=normals, faces=faces, frames=frames, radiance=radiance
+        {"H": 9}, vertices=vertices, normals=normals, faces=faces, turns=turns, radiance=radiance
     )
     batch, n, n_pairs = sizes["B"], sizes["V"], kernels.PAIRS
     index, pairs = incidence("faces", faces, n, "vertices"), _pairs(vertices.device)
-    vertices, normals, frames, radiance = contiguous(vertices, normals, frames, radiance)
+    vertices, normals, turns, radiance = contiguous(vertices, normals, turns, radiance)
     params = pairs._asdict() | {
         "batch": batch, "n_vertices": n, "n_faces": len(faces), "vertices": vertices, "normals": normals,
-        "faces": index.table, "offsets": index.offsets, "entries": index.entries, "frames": frames,
-        "radiance": radiance, "radius": vertices.new_empty(batch), "rough": vertices.new_empty(batch, n, 4),
+        "faces": index.table, "offsets": index.offsets, "entries": index.entries, "turns": turns,
+        "radiance": radiance, "lights": vertices.new_empty(batch, n_pairs, 2, 3),
+        "radius": vertices.new_empty(batch), "rough": vertices.new_empty(batch, n, 4),
         "out": vertices.new_empty(batch, n, 4),
     }  # fmt: skip
     if vertices.is_cuda:
@@ -114,20 +112,15 @@ def sky_exposure(
 
 
 class _Pairs(NamedTuple):
-    """Opposite directions of the sky."""
+    """The first of each two opposite directions of the sky."""
 
-    pairs: Int[Tensor, "P 2"]
-    """Their numbers, int32."""
     axes: Float[Tensor, "P 3 3"]
-    """Of the first."""
     weights: Float[Tensor, "P"]
-    """Of either."""
 
 
 @functools.cache
 def _pairs(device: torch.device) -> _Pairs:
     sky = sky_directions(torch.device("cpu"))
     opposite = torch.cdist(sky.directions, -sky.directions).argmin(1)
-    first = torch.nonzero(torch.arange(N_DIRECTIONS) < opposite)[:, 0]
-    pairs = torch.stack([first, opposite[first]], 1).int()
-    return _Pairs(*(part.contiguous().to(device) for part in (pairs, sky.axes[first], sky.weights[first])))
+    first = torch.arange(len(opposite)) < opposite
+    return _Pairs(sky.axes[first].to(device), sky.weights[first].to(device))

@@ -8,7 +8,7 @@ from oasis_warp.ops.face_rotations import face_rotations
 from oasis_warp.ops.mesh_posing import pose_on_mesh
 from oasis_warp.ops.rasterization import rasterization
 from oasis_warp.ops.skinning import skin
-from oasis_warp.ops.sky_exposure import N_DIRECTIONS, sky_exposure
+from oasis_warp.ops.sky_exposure import sky_exposure
 from oasis_warp.ops.visibility import depth_visibility
 
 
@@ -31,7 +31,7 @@ def warm_up(device: torch.device | str = "cpu") -> None:
         turned = face_rotations(vertices, vertices, faces)
         each = torch.arange(4, device=device)
         posed = pose_on_mesh(vertices, faces, each, thirds, turned.vertex_quats, turned.area_ratio, quats, scales)
-        sky_exposure(vertices[None], vertices[None], faces, viewmat[None, :3, :3], ones.new_ones(1, N_DIRECTIONS, 3))
+        sky_exposure(vertices[None], vertices[None], faces, quats[:1], ones.new_ones(9, 3))
         each, none = each.int(), each[:1, None].int()
         whole = ContactTables(each, 4 * each[:2], 0 * each, none, none, none, ones, 4 * each, each, ones)
         contact_shifts(vertices[None], faces, whole, False)
