@@ -27,7 +27,7 @@ from oasis_warp.avatar.sky import (
     sky_mesh,
     studio_light,
 )
-from oasis_warp.core import rotation, surface
+from oasis_warp.core import rotation
 from oasis_warp.core.camera import camera_center
 from oasis_warp.core.mirror import mirror_light, mirror_points
 from oasis_warp.core.types import HandLight
@@ -36,6 +36,7 @@ from oasis_warp.hand.contact import resolve_contact
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import skin_surface
 from oasis_warp.hand_avatar import Avatar
+from oasis_warp.ops.corner_reading import read_at
 
 EVEN = HandLight(
     torch.tensor([[1.0] * 3, *[[0.0] * 3] * 3]), torch.tensor([[0.1] * 3, [2.0] * 3]), torch.ones(3),
@@ -58,7 +59,7 @@ def seen(hand, crop, posed):
 def test_the_coarse_mesh_is_that_of_the_hand(hand):
     mesh = sky_mesh(torch.device("cpu"))
     assert int(mesh.vertices.max()) < len(hand.template) and int(mesh.faces.max()) < len(mesh.vertices)
-    read = surface.read_at(hand.template[mesh.vertices], mesh.corners)
+    read = read_at(hand.template[mesh.vertices], mesh.corners)
     assert float((read - hand.template).norm(dim=1).max()) < 0.003
     assert float(hand.weights[mesh.still, 0]) > 0.99
 

@@ -23,7 +23,7 @@ CONSTANTS = {
     "SIZE": SIZE, "MARGIN": f"{MARGIN}f", "LIFT": f"{LIFT}f", "STEEPEST": f"{STEEPEST}f", "LEAST": f"{LEAST}f",
     "PAIRS": PAIRS, "SLACK": f"{SLACK}f",
 }  # fmt: skip
-DRAW_BLOCK, VERTEX_BLOCK = 512, 128
+DRAW_BLOCK, VERTEX_BLOCK = 1024, 128
 """Threads of a block."""
 
 expose = native("scene/sky_exposure.cpp", "expose", label="sky_exposure", constants=CONSTANTS)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from oasis_warp.adaptation.adam import Adam
 from oasis_warp.adaptation.prior_guess import Calibration
-from oasis_warp.avatar.anchors import vertex_to_gaussians
+from oasis_warp.avatar.anchors import gaussian_corners
 from oasis_warp.core import surface
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.logging import Progress
@@ -22,6 +22,7 @@ from oasis_warp.core.types import CanonicalGaussians
 from oasis_warp.losses import SsimTarget, masked_dssim, masked_l1, ssim_target
 from oasis_warp.network.heads import ColorHeads, head_colors, zero_updates
 from oasis_warp.ops import BlendWeights, blend_colors
+from oasis_warp.ops.corner_reading import read_at
 
 AVERAGED = 7
 """The result is the mean of so many last steps, one for each reference view."""
@@ -184,10 +185,10 @@ def learn_texture(
     residual = torch.zeros(len(gaussians.face_index), 3, dtype=base.dtype, device=base.device, requires_grad=True)
     none = torch.zeros(n_points, 3, dtype=base.dtype, device=base.device)
     trust, vertex_trust = _trust(gaussians, faces, targets.weights)
-    edges = surface.mesh_edges(faces)
+    edges, corners = surface.mesh_edges(faces), gaussian_corners(faces, gaussians)
 
     def colors() -> Tensor:
-        learned = vertex_to_gaussians(vertex_trust * field, faces, gaussians)
+        learned = read_at(vertex_trust * field, corners)
         return torch.sigmoid(base + learned + trust * torch.cat([none, residual]))
 
     def penalty() -> Tensor:

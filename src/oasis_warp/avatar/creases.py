@@ -18,8 +18,8 @@ from oasis_warp.avatar.folds import LEAST, MIN_COLOR, Folds, beyond_shallow, edg
 from oasis_warp.avatar.sky import sky_mesh
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
-from oasis_warp.core.surface import Corners, read_at
 from oasis_warp.core.types import CanonicalGaussians
+from oasis_warp.ops.corner_reading import Corners, read_at
 
 PASSES = 60
 """Smoothings over the mesh that leave a palm without its creases, about 15 mm."""

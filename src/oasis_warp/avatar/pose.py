@@ -13,9 +13,9 @@ from oasis_warp.avatar.folds import Opening
 from oasis_warp.avatar.sky import arriving, arriving_before, exposure, harmonic_basis, in_crevices, largest_nearby
 from oasis_warp.core import rotation, surface
 from oasis_warp.core.mirror import mirror_light, mirror_points
-from oasis_warp.core.surface import Corners, read_at
 from oasis_warp.core.types import CanonicalGaussians, Gaussians, HandLight
 from oasis_warp.ops import RestMesh, face_rotations, pose_mesh_gaussians
+from oasis_warp.ops.corner_reading import Corners, read_at
 from oasis_warp.ops.sky_exposure import sky_directions
 
 GAMMA = 2.2

@@ -14,8 +14,8 @@ from torch.nn.functional import pad
 from oasis_warp.assets import asset
 from oasis_warp.core import surface
 from oasis_warp.core.color import LUMINANCE
-from oasis_warp.core.surface import Corners, read_at
 from oasis_warp.core.types import HandLight
+from oasis_warp.ops.corner_reading import Corners, read_at
 from oasis_warp.ops.sky_exposure import sky_exposure
 
 LOBE = (1.0, 2 / 3, 1 / 4)

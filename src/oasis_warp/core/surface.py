@@ -1,11 +1,9 @@
 """Areas, normals and neighbourhoods of triangle meshes in torch."""
 
-from typing import NamedTuple
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import embedding_bag, normalize, pad
+from torch.nn.functional import normalize, pad
 
 
 def face_normals(
@@ -96,18 +94,3 @@ def face_crosses(vertices: Float[Tensor, "*B V 3"], faces: Int[Tensor, "F 3"]) -
     """Cross products of two edges of each face: its normal, as long as twice its area."""
     a, b, c = vertices[..., faces, :].unbind(-2)
     return torch.linalg.cross(b - a, c - a)
-
-
-class Corners(NamedTuple):
-    """How N places of a surface read a field over its vertices."""
-
-    index: Int[Tensor, "N 3"]
-    """int32."""
-    weights: Float[Tensor, "N 3"]
-
-
-def read_at(values: Float[Tensor, "*B V D"], corners: Corners) -> Float[Tensor, "*B N D"]:
-    """A field over the vertices, or many, read at places of the surface."""
-    rows = values.movedim(-2, 0)
-    read = embedding_bag(corners.index, rows.flatten(1), per_sample_weights=corners.weights.to(values), mode="sum")
-    return read.unflatten(1, rows.shape[1:]).movedim(0, -2)
