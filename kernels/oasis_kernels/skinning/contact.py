@@ -5,8 +5,8 @@ thread per part and image: `boxes` of its skin, and of its skin with the flesh u
 next to it meets any. One thread per group: `group_boxes`. One per part and group: `meetings`, the parts of the group
 that have skin where it has flesh, or the other way round. One thread per vertex: `normals` of what is reached; `find`,
 the nearest skin that the vertex faces in those parts; `contacts`, the same again among neighbours of the last one, and
-the shift that leads out of it; `spread`, the mean of the shifts around; `closeness`, how near to that skin
-this leaves the vertex. Normals are those before contact.
+the shift that leads out of it; `spread`, the mean of the shifts around, where `moving` has found that one of these can
+have a shift; `closeness`, how near to that skin this leaves the vertex. Normals are those before contact.
 """
 
 import warp as wp
