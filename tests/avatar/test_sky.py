@@ -36,7 +36,7 @@ from oasis_warp.hand.contact import resolve_contact
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.skinning import skin_surface
 from oasis_warp.hand_avatar import Avatar
-from oasis_warp.ops.corner_reading import read_at
+from oasis_warp.ops.corner_reading import read_corners
 
 EVEN = HandLight(
     torch.tensor([[1.0] * 3, *[[0.0] * 3] * 3]), torch.tensor([[0.1] * 3, [2.0] * 3]), torch.ones(3),
@@ -59,7 +59,7 @@ def seen(hand, crop, posed):
 def test_the_coarse_mesh_is_that_of_the_hand(hand):
     mesh = sky_mesh(torch.device("cpu"))
     assert int(mesh.vertices.max()) < len(hand.template) and int(mesh.faces.max()) < len(mesh.vertices)
-    read = read_at(hand.template[mesh.vertices], mesh.corners)
+    read = read_corners(hand.template[mesh.vertices], mesh.corners)
     assert float((read - hand.template).norm(dim=1).max()) < 0.003
     assert float(hand.weights[mesh.still, 0]) > 0.99
 

@@ -5,7 +5,8 @@
 // filtered (Reeves et al. 1987): four texels, bilinear, each with a ramp. What arrives is the sum over directions d of
 // w_d max(0, n . d) L(d) V(d), over the same sum without V; then the mean over the corners of the faces around.
 //
-// Phases: images, into axes that turn with the surface; pairs of directions; vertices; vertices again.
+// Phases: images are turned into the axes of the surface; pairs of directions are drawn and looked into; vertices add
+// up what arrives; vertices average it over the faces around.
 
 void expose(
 #include "sky_parameters.inc"

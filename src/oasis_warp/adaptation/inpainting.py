@@ -6,8 +6,9 @@ import numpy as np
 import scipy.sparse as sparse
 import torch
 from jaxtyping import Float, Int
-from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
+
+from oasis_warp.core.sparse_factors import factorized, sparse_order
 
 DETAIL_LENGTH = 0.001
 """Length below which differences between neighbouring observations are averaged [m]."""
@@ -46,13 +47,8 @@ def inpaint(
     system = laplacian + sparse.diags((data + mass / fade**2)[order])
     right = data[:, None] * observed.detach().cpu().numpy().astype(np.float64)
     solution = np.empty_like(right)
-    solution[order] = _factorized(system, "NATURAL").solve(np.ascontiguousarray(right[order]))
+    solution[order] = factorized(system).solve(np.ascontiguousarray(right[order]))
     return torch.from_numpy(solution).to(observed)
-
-
-def _factorized(system: sparse.sparray, order: str) -> SuperLU:
-    """Of a positive definite matrix: without pivots the factors take half the time and memory."""
-    return splu(system.tocsc(), permc_spec=order, diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
 @functools.lru_cache(2)
@@ -73,7 +69,7 @@ def _order(triangles: bytes, n: int) -> np.ndarray:
     corners = np.frombuffer(triangles, np.int64).reshape(-1, 3)
     ends = corners.ravel(), np.roll(corners, 1, 1).ravel()
     beside = sparse.coo_array((np.ones(corners.size), ends), shape=(n, n))
-    return np.argsort(_factorized(beside + beside.T + corners.size * sparse.eye_array(n), "MMD_AT_PLUS_A").perm_c)
+    return sparse_order(beside + beside.T + corners.size * sparse.eye_array(n))
 
 
 def laplacian_and_mass(points: np.ndarray, triangles: np.ndarray) -> tuple[sparse.csc_array, np.ndarray]:

@@ -22,7 +22,7 @@ from oasis_warp.core.types import CanonicalGaussians
 from oasis_warp.losses import SsimTarget, masked_dssim, masked_l1, ssim_target
 from oasis_warp.network.heads import ColorHeads, head_colors, zero_updates
 from oasis_warp.ops import BlendWeights, blend_colors
-from oasis_warp.ops.corner_reading import read_at
+from oasis_warp.ops.corner_reading import read_corners
 
 AVERAGED = 7
 """The result is the mean of so many last steps, one for each reference view."""
@@ -188,7 +188,7 @@ def learn_texture(
     edges, corners = surface.mesh_edges(faces), gaussian_corners(faces, gaussians)
 
     def colors() -> Tensor:
-        learned = read_at(vertex_trust * field, corners)
+        learned = read_corners(vertex_trust * field, corners)
         return torch.sigmoid(base + learned + trust * torch.cat([none, residual]))
 
     def penalty() -> Tensor:

@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 from oasis_warp.core import rotation, surface
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, PosedHand
-from oasis_warp.ops.corner_reading import Corners, read_at
+from oasis_warp.ops.corner_reading import Corners, read_corners
 
 VERTEX_SPREAD = 0.75
 """Standard deviation of a vertex Gaussian over the radius of a disc of the vertex's area: neighbours blend at 60 %."""
@@ -189,4 +189,4 @@ def vertex_to_gaussians(
     values: Float[Tensor, "V D"], faces: Int[Tensor, "F 3"], anchors: Anchors | CanonicalGaussians
 ) -> Float[Tensor, "N D"]:
     """A field over the vertices, read at every Gaussian."""
-    return read_at(values, gaussian_corners(faces, anchors))
+    return read_corners(values, gaussian_corners(faces, anchors))

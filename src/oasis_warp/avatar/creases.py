@@ -19,7 +19,7 @@ from oasis_warp.avatar.sky import sky_mesh
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians
-from oasis_warp.ops.corner_reading import Corners, read_at
+from oasis_warp.ops.corner_reading import Corners, read_corners
 
 PASSES = 60
 """Smoothings over the mesh that leave a palm without its creases, about 15 mm."""
@@ -90,7 +90,7 @@ def _palm_skin(hand: HandModel) -> tuple[Int[Tensor, "S"], Int[Tensor, "E 2"], F
 @torch.no_grad()
 def flat_creases(creases: Creases, posed: Float[Tensor, "*B V 3"]) -> Float[Tensor, "*B M 3"]:
     """What a posed surface [m] adds to the logarithms of the colours of creases."""
-    return read_at(flat_share(creases, posed)[..., None], creases.corners) * creases.change
+    return read_corners(flat_share(creases, posed)[..., None], creases.corners) * creases.change
 
 
 @torch.no_grad()
@@ -98,7 +98,7 @@ def flat_share(creases: Creases, posed: Float[Tensor, "*B V 3"]) -> Float[Tensor
     """How flat creases are at the vertices of a posed surface [m], 0 to 1."""
     mesh = sky_mesh(posed.device)
     grown = (_coarse_areas(posed) / creases.areas).log()
-    grown = read_at(grown[..., None], mesh.corners)[..., 0]
+    grown = read_corners(grown[..., None], mesh.corners)[..., 0]
     return ((grown - AS_IN_PHOTO) / (STRETCHED - AS_IN_PHOTO)).clamp(0, 1)
 
 

@@ -15,7 +15,7 @@ from oasis_warp.core import rotation, surface
 from oasis_warp.core.mirror import mirror_light, mirror_points
 from oasis_warp.core.types import CanonicalGaussians, Gaussians, HandLight
 from oasis_warp.ops import RestMesh, face_rotations, pose_mesh_gaussians
-from oasis_warp.ops.corner_reading import Corners, read_at
+from oasis_warp.ops.corner_reading import Corners, read_corners
 from oasis_warp.ops.sky_exposure import sky_directions
 
 GAMMA = 2.2
@@ -205,15 +205,15 @@ def shading_factors(
         corners = gaussian_corners(faces, canonical)
     of_vertices = shading(light, on)
     if light.facing is None:
-        return _opened(read_at(of_vertices, corners), opening)
+        return _opened(read_corners(of_vertices, corners), opening)
     stays = remaining_shade(light, on, seen)
     if viewed is not None:
         stays = stays * viewed[..., None, None]
     if light.shade is not None:  # all of it is smooth, or of pixels beside outlines
         of_vertices = of_vertices * (1 + stays[..., :1] * (light.shade - 1))
     if canonical.shade is None and opening is None:
-        return read_at(of_vertices, corners)
-    read = read_at(torch.cat([of_vertices, stays], -1), corners)
+        return read_corners(of_vertices, corners)
+    read = read_corners(torch.cat([of_vertices, stays], -1), corners)
     of_deep, of_weak = read[..., 3:4], read[..., 4:]
     factors = _opened(read[..., :3], opening, of_weak)
     if canonical.shade is None:

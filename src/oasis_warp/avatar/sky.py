@@ -15,7 +15,7 @@ from oasis_warp.assets import asset
 from oasis_warp.core import surface
 from oasis_warp.core.color import LUMINANCE
 from oasis_warp.core.types import HandLight
-from oasis_warp.ops.corner_reading import Corners, read_at
+from oasis_warp.ops.corner_reading import Corners, read_corners
 from oasis_warp.ops.sky_exposure import sky_exposure
 
 LOBE = (1.0, 2 / 3, 1 / 4)
@@ -83,7 +83,7 @@ def sky_mesh(device: torch.device) -> SkyMesh:
 
 def _within_rings(faces: np.ndarray, count: int) -> np.ndarray:
     """Vertices within `NEARBY` rings of each of `count` vertices; the last of a row also fills it up."""
-    rows, columns = (np.repeat(faces, 3, axis=1).ravel(), np.tile(faces, 3).ravel())
+    rows, columns = np.repeat(faces, 3, axis=1).ravel(), np.tile(faces, 3).ravel()
     beside = sparse.csr_array((np.ones(len(rows)), (rows, columns)), (count, count))
     near = sparse.csr_array(sparse.linalg.matrix_power(beside, NEARBY))
     sizes = np.diff(near.indptr)
@@ -94,7 +94,7 @@ def largest_nearby(values: Float[Tensor, "*B V"]) -> Float[Tensor, "*B V"]:
     """The largest of `values` over `NEARBY` rings of coarse faces around each vertex."""
     mesh = sky_mesh(values.device)
     coarse = values[..., mesh.vertices][..., mesh.nearby].amax(-1)
-    return read_at(coarse[..., None], mesh.corners)[..., 0]
+    return read_corners(coarse[..., None], mesh.corners)[..., 0]
 
 
 def harmonic_basis(directions: Float[Tensor, "*B 3"], count: int) -> Float[Tensor, "*B K"]:
@@ -141,7 +141,7 @@ def exposure(
     )
     turns = quats[..., mesh.still, :].float().reshape(-1, 4)
     found = sky_exposure(coarse, facing, mesh.faces, turns, radiance_harmonics(light).float())
-    return read_at(found, mesh.corners).to(posed).reshape(*batch, -1, 4)
+    return read_corners(found, mesh.corners).to(posed).reshape(*batch, -1, 4)
 
 
 def bounced(exposure: Float[Tensor, "*B 3"], albedo: Float[Tensor, "3"]) -> Float[Tensor, "*B 3"]:

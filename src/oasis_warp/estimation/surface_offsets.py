@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy import sparse
-from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
+from scipy.sparse.linalg import LinearOperator, SuperLU, cg
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -29,6 +29,7 @@ from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core import surface
 from oasis_warp.core.camera import project
 from oasis_warp.core.hand_model import HandModel
+from oasis_warp.core.sparse_factors import factorized, sparse_order
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandFit
 from oasis_warp.estimation.fit_problem import mirrored_fit
 from oasis_warp.estimation.landmarks import box_size
@@ -267,7 +268,7 @@ class ThinSheet:
         np.add.at(diagonal, vertices, weight)
         np.add.at(right, vertices, weight[:, None] * target)
         diagonal, right = diagonal[self._order], right[self._order]
-        factors = self._factors or _factorized(self._stiffness + sparse.diags_array(diagonal), "NATURAL")
+        factors = self._factors or factorized((self._stiffness + sparse.diags_array(diagonal)).astype(np.float32))
         self._factors = factors
 
         def system(x: np.ndarray) -> np.ndarray:
@@ -284,12 +285,6 @@ class ThinSheet:
         found = np.empty_like(right)
         found[self._order] = solution.reshape(right.shape)
         return found
-
-
-def _factorized(system: sparse.sparray, order: str) -> SuperLU:
-    """Float32 factors of a positive definite matrix."""
-    options = {"SymmetricMode": True}
-    return splu(system.tocsc().astype(np.float32), permc_spec=order, diag_pivot_thresh=0.0, options=options)
 
 
 def _operator(function: Callable[[np.ndarray], np.ndarray], shape: tuple[int, int]) -> LinearOperator:
@@ -311,5 +306,5 @@ def _bending(faces: bytes, n: int) -> tuple[sparse.csc_array, np.ndarray]:
     share = 1 / np.bincount(pairs[0], minlength=n)[pairs[0]]
     umbrella = sparse.csr_array((share, tuple(pairs)), shape=(n, n)) - sparse.eye_array(n)
     stiffness = (_BEND * umbrella.T @ umbrella + _STAY * sparse.eye_array(n)).tocsc()
-    order = np.argsort(_factorized(stiffness, "MMD_AT_PLUS_A").perm_c)
+    order = sparse_order(stiffness.astype(np.float32))
     return stiffness[order][:, order].tocsc(), order

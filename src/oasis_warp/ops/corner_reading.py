@@ -19,7 +19,7 @@ class Corners(NamedTuple):
     weights: Float[Tensor, "N 3"]
 
 
-def read_at(values: Float[Tensor, "*B V D"], corners: Corners) -> Float[Tensor, "*B N D"]:
+def read_corners(values: Float[Tensor, "*B V D"], corners: Corners) -> Float[Tensor, "*B N D"]:
     """The sums sum_k w_k values[corner k] at N places, for one field or many; indices are trusted.
 
     Differentiable by the values; gradients add up in a fixed order.
