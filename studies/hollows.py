@@ -13,8 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.avatar.observation import Observation, observe
-from oasis_warp.avatar.pose import GAMMA, posed_lighting
 from oasis_warp.avatar.sky import arriving, harmonic_basis
+from oasis_warp.avatar.vertex_light import GAMMA, posed_lighting
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.types import HandCrop, HandLight, PosedHand
 from oasis_warp.data.photo import read_photo

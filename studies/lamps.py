@@ -12,8 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp.avatar.anchors import vertex_colors
-from oasis_warp.avatar.pose import GAMMA
 from oasis_warp.avatar.sky import arriving, harmonic_basis
+from oasis_warp.avatar.vertex_light import GAMMA
 from oasis_warp.core.types import PosedHand
 from oasis_warp.ops import depth_visibility
 from oasis_warp.synthetic.illumination import look_at

@@ -93,7 +93,7 @@ PIPELINE = [
     _of("adaptation/sh_lighting", "adaptation/test_sh_lighting", "single_gaussians", "marks judged per Gaussian",
         "albedo = read[:, 4:] * torch.lerp(beyond, skin, read[:, 3:4])",
         "albedo = torch.lerp(beyond, skin, 1 - mark_probability(beyond))"),
-    _of("avatar/pose", "avatar/test_sky", "what_cast_it", "a shadow outlives what cast it",
+    _of("avatar/vertex_light", "avatar/test_sky", "what_cast_it", "a shadow outlives what cast it",
         "change = (on.exposure[..., 0] - seen).clamp_min(0)", "change = 0 * on.exposure[..., 0]"),
     _of("avatar/folds", "avatar/test_folds", "straight_ones", "seen and painted folds swapped",
         "seen, painted = of_photo * (1 - folds.painted), of_straight * folds.painted",

@@ -10,18 +10,17 @@ from torch import Tensor
 from oasis_warp.avatar.anchors import gaussian_corners
 from oasis_warp.avatar.creases import Creases, find_creases
 from oasis_warp.avatar.folds import Folds, find_folds, open_folds
-from oasis_warp.avatar.pose import (
+from oasis_warp.avatar.pose import in_even_light, pose_gaussians
+from oasis_warp.avatar.sky import NOTHING_HIDDEN
+from oasis_warp.avatar.vertex_light import (
     GAMMA,
     SurfaceLight,
-    in_even_light,
     mirror_surface_light,
-    pose_gaussians,
     view_direction,
     view_share,
     with_photo,
     with_todays_light,
 )
-from oasis_warp.avatar.sky import NOTHING_HIDDEN
 from oasis_warp.core.camera import camera_center
 from oasis_warp.core.color import plain_background
 from oasis_warp.core.config import BLACK, WHITE

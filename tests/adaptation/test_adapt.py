@@ -15,8 +15,9 @@ from oasis_warp.adaptation.reliability import observe_photos, photo_gains
 from oasis_warp.adaptation.unlit import unlit_detail, view_in_photo
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.observation import inner_mask, observe
-from oasis_warp.avatar.pose import pose_gaussians, with_photo
+from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanHands, MeanPrior
+from oasis_warp.avatar.vertex_light import with_photo
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.types import CanonicalGaussians, HandCrop
 from oasis_warp.losses import masked_psnr

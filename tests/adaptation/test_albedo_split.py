@@ -15,8 +15,9 @@ from oasis_warp.adaptation.sh_lighting import (
 )
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors
-from oasis_warp.avatar.pose import Lighting, posed_lighting, shading_factors
+from oasis_warp.avatar.pose import shading_factors
 from oasis_warp.avatar.prior import MeanPrior
+from oasis_warp.avatar.vertex_light import Lighting, posed_lighting
 from oasis_warp.core.types import HandLight
 
 SHADOW = (0.55, 0.4, 0.3)

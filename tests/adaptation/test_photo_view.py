@@ -8,7 +8,8 @@ from oasis_warp.adaptation.photo_view import match_photos
 from oasis_warp.avatar.anchors import vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.observation import inner_mask, observe
-from oasis_warp.avatar.pose import pose_gaussians, posed_lighting, shading_factors
+from oasis_warp.avatar.pose import pose_gaussians, shading_factors
+from oasis_warp.avatar.vertex_light import posed_lighting
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.types import HandLight
 from oasis_warp.losses import masked_psnr

@@ -15,17 +15,10 @@ from oasis_warp.adaptation.sh_lighting import (
 from oasis_warp.avatar.anchors import vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.observation import observe
-from oasis_warp.avatar.pose import (
-    Lighting,
-    in_even_light,
-    pose_gaussians,
-    posed_lighting,
-    rotate_light,
-    shading,
-    with_photo,
-)
+from oasis_warp.avatar.pose import in_even_light, pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.avatar.sky import environment_light
+from oasis_warp.avatar.vertex_light import Lighting, posed_lighting, rotate_light, shading, with_photo
 from oasis_warp.core import rotation
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.mirror import mirror_light, mirror_points

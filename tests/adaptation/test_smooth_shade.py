@@ -6,7 +6,7 @@ from oasis_warp.adaptation.smooth_shade import spread_shade
 from oasis_warp.avatar.anchors import vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.observation import observe
-from oasis_warp.avatar.pose import posed_lighting
+from oasis_warp.avatar.vertex_light import posed_lighting
 from oasis_warp.core.types import HandLight
 from oasis_warp.hand.poses import named_pose
 

@@ -5,7 +5,8 @@ from synthetic import avatar_of, crop_of
 from oasis_warp.avatar import folds as found
 from oasis_warp.avatar.anchors import vertex_colors
 from oasis_warp.avatar.appearance import label_regions
-from oasis_warp.avatar.pose import in_even_light, posed_lighting
+from oasis_warp.avatar.pose import in_even_light
+from oasis_warp.avatar.vertex_light import posed_lighting
 from oasis_warp.core.types import HandLight, HandPose
 from oasis_warp.hand_avatar import Avatar
 

@@ -10,7 +10,7 @@ from oasis_warp.avatar.anchors import place_anchors, vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors, region_masks
 from oasis_warp.avatar.densify import GROUND_DEPTH, coarsen, densify, parts_for_spacing, read_at
 from oasis_warp.avatar.observation import inner_mask, observe
-from oasis_warp.avatar.pose import pose_gaussians, with_photo
+from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.avatar.quality import (
     REACH,
@@ -21,6 +21,7 @@ from oasis_warp.avatar.quality import (
     coverage_warnings,
     photo_warnings,
 )
+from oasis_warp.avatar.vertex_light import with_photo
 from oasis_warp.core import surface
 from oasis_warp.core.camera import orbit_camera, project
 from oasis_warp.core.config import AdaptConfig

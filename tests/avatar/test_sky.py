@@ -6,16 +6,9 @@ import torch
 from synthetic import as_left_hand, avatar_of, crop_of
 
 from oasis_warp.avatar import pose as posing
+from oasis_warp.avatar import vertex_light as lit
 from oasis_warp.avatar.appearance import label_regions, region_colors
-from oasis_warp.avatar.pose import (
-    Lighting,
-    posed_lighting,
-    remaining_shade,
-    rotate_light,
-    shading_factors,
-    split_shade,
-    with_photo_colors,
-)
+from oasis_warp.avatar.pose import shading_factors, split_shade, with_photo_colors
 from oasis_warp.avatar.sky import (
     IN_CREVICES,
     arriving_before,
@@ -23,10 +16,10 @@ from oasis_warp.avatar.sky import (
     environment_light,
     harmonic_basis,
     in_crevices,
-    radiance_harmonics,
     sky_mesh,
     studio_light,
 )
+from oasis_warp.avatar.vertex_light import Lighting, posed_lighting, remaining_shade, rotate_light
 from oasis_warp.core import rotation
 from oasis_warp.core.camera import camera_center
 from oasis_warp.core.mirror import mirror_light, mirror_points
@@ -198,13 +191,6 @@ def test_harmonics_turn_and_mirror_with_the_world(rows):
     torch.testing.assert_close(mirrored, before)
 
 
-def test_radiance_is_what_the_cosine_lobe_blurs():
-    light = EVEN._replace(harmonics=torch.tensor([[1.0] * 3, [0.2] * 3, [0.0] * 3, [-0.4] * 3]))
-    harmonics = radiance_harmonics(light)
-    torch.testing.assert_close((harmonic_basis(torch.eye(3), 9) @ harmonics)[:, 0], torch.tensor([1.3, 1.0, 0.4]))
-    assert not harmonics[4:].any()
-
-
 def test_an_environment_map_lights_what_faces_its_bright_side():
     """Rows are from above to below (-y to y), the middle column is where the camera looks (z), right is x."""
     n = torch.eye(3)
@@ -260,11 +246,12 @@ def test_a_file_with_other_light_in_hollows_looks_as_before_in_its_photo(hand, s
     old.save(tmp_path / "today.safetensors")
     with monkeypatch.context() as before:
         before.setattr(avatar_file, "VERSION", version)
-        before.setattr(posing, "arriving", functools.partial(arriving_before, version))
+        before.setattr(lit, "arriving", functools.partial(arriving_before, version))
+        before.setattr(posing, "vertex_light", lit.vertex_light_in_steps)
         old.save(tmp_path / "old.safetensors")
         wanted = old.pose(old.source_pose).colors
     read, unchanged = (Avatar.load(tmp_path / f"{name}.safetensors") for name in ("old", "today"))
-    darkest = posing.MIN_LIGHT ** (1 / posing.GAMMA)
+    darkest = lit.MIN_LIGHT ** (1 / lit.GAMMA)
     torch.testing.assert_close(read.pose(old.source_pose).colors, wanted, atol=darkest, rtol=0)
     assert float((unchanged.pose(old.source_pose).colors - wanted).abs().max()) > 0.01
 
@@ -340,7 +327,8 @@ def test_the_fist_of_an_avatar_is_darker_between_its_fingers(hand, monkeypatch):
     crop, truth, source = crop_of(hand, 0.8 * region_colors(label_regions(hand), 0.03), pose_name="open", size=48)
     avatar = avatar_of(hand, truth, source, crop.camera, None).in_light(studio_light())
     dark = avatar.pose("fist").colors
-    monkeypatch.setattr(posing, "in_crevices", lambda closeness, exposure: torch.ones_like(exposure[..., 1:]))
+    monkeypatch.setattr(posing, "vertex_light", lit.vertex_light_in_steps)
+    monkeypatch.setattr(lit, "in_crevices", lambda closeness, exposure: torch.ones_like(exposure[..., 1:]))
     change = (dark / avatar.pose("fist").colors)[: len(truth.vertex_index), 1]
     pose = avatar.held("fist")
     closeness = resolve_contact(hand, skin_surface(hand, avatar.rest, pose)).closeness

@@ -8,7 +8,8 @@ from torch.nn.functional import normalize
 
 from oasis_warp.avatar.anchors import RIM_FADE, place_anchors, vertex_to_gaussians
 from oasis_warp.avatar.densify import densify
-from oasis_warp.avatar.pose import pose_gaussians, with_photo
+from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.avatar.vertex_light import with_photo
 from oasis_warp.avatar.wrist import (
     ARM_LENGTH,
     BEFORE_RIM,

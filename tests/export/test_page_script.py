@@ -14,7 +14,7 @@ from tests.export.page_parts import LARGEST, section
 
 from oasis_kernels import constants
 from oasis_kernels.scene import sky_exposure as kernels
-from oasis_warp.avatar import pose
+from oasis_warp.avatar import pose, vertex_light
 from oasis_warp.avatar.sky import studio_light
 from oasis_warp.core.camera import ORBIT_FIELD_OF_VIEW, orbit_camera
 from oasis_warp.export.page_data import NO_JOINT, unpack_data
@@ -28,13 +28,13 @@ NODE = shutil.which("node")
 @pytest.mark.parametrize(
     ("file", "name", "value"),
     [
-        ("shading.js", "GAMMA", pose.GAMMA),
-        ("shading.js", "SAME_POSE", pose.SAME_POSE),
-        ("shading.js", "OTHER_POSE", pose.OTHER_POSE),
-        ("shading.js", "SAME_SKY", pose.SAME_SKY),
-        ("shading.js", "OTHER_SKY", pose.OTHER_SKY),
-        ("shading.js", "SAME_BESIDE", pose.SAME_BESIDE),
-        ("shading.js", "OTHER_BESIDE", pose.OTHER_BESIDE),
+        ("shading.js", "GAMMA", vertex_light.GAMMA),
+        ("shading.js", "SAME_POSE", vertex_light.SAME_POSE),
+        ("shading.js", "OTHER_POSE", vertex_light.OTHER_POSE),
+        ("shading.js", "SAME_SKY", vertex_light.SAME_SKY),
+        ("shading.js", "OTHER_SKY", vertex_light.OTHER_SKY),
+        ("shading.js", "SAME_BESIDE", vertex_light.SAME_BESIDE),
+        ("shading.js", "OTHER_BESIDE", vertex_light.OTHER_BESIDE),
         ("shading.js", "NO_JOINT", NO_JOINT),
         ("shading.js", "WEAK", pose.WEAK),
         ("shading.js", "DEEP", pose.DEEP),

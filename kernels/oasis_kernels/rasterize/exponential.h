@@ -1,4 +1,4 @@
-// e^x for -80 < x <= 0, for scalars and for vectors: VECTOR of float, INTEGERS of int.
+// e^x for -80 < x < 80, for scalars and for vectors: VECTOR of float, INTEGERS of int.
 
 // e^x = 2^f 2^n with n the whole number nearest to x log2(e): adding 1.5 * 2^23 rounds, and leaves n in the low
 // bits, from where it is added to the exponent. 2^f on |f| <= 0.5 is a minimax polynomial, relative error 2e-7.

@@ -1,4 +1,5 @@
-// The turn of an image's directions as a matrix, and the light from a turned direction, on the CPU and on CUDA.
+// The turn of an image's directions as a matrix, and the light from a turned direction, on the CPU and on CUDA. The
+// harmonics are those of irradiance: a cosine lobe leaves 2/3 and 1/4 of the first and second degree.
 auto matrix_of = [&](const float* q, float* m) {
     const float w = q[0], x = q[1], y = q[2], z = q[3];
     m[0] = 1.f - 2.f * (y * y + z * z), m[1] = 2.f * (x * y - w * z), m[2] = 2.f * (x * z + w * y);
@@ -9,10 +10,11 @@ auto light_from = [&](const float* m, const float* d, float sign, float* to) {
     const float x = sign * (m[0] * d[0] + m[1] * d[1] + m[2] * d[2]);
     const float y = sign * (m[3] * d[0] + m[4] * d[1] + m[5] * d[2]);
     const float z = sign * (m[6] * d[0] + m[7] * d[1] + m[8] * d[2]);
-    const float basis[9] = {1.f, x, y, z, x * y, y * z, 3.f * z * z - 1.f, x * z, x * x - y * y};
+    const float second[5] = {x * y, y * z, 3.f * z * z - 1.f, x * z, x * x - y * y};
     for (int c = 0; c < 3; c++) {
-        float sum = 0.f;
-        for (int k = 0; k < 9; k++) sum += basis[k] * radiance[3 * k + c];
+        const float* h = harmonics + c;
+        float sum = h[0] + 1.5f * (h[3] * x + h[6] * y + h[9] * z);
+        for (int k = 4; k < n_harmonics; k++) sum += 4.f * h[3 * k] * second[k - 4];
         to[c] = sum > 0.f ? sum : 0.f;
     }
 };

@@ -24,7 +24,8 @@ from oasis_warp.adaptation.unlit import (
 )
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.observation import inner_mask, observe
-from oasis_warp.avatar.pose import in_even_light, posed_lighting, shading_factors
+from oasis_warp.avatar.pose import in_even_light, shading_factors
+from oasis_warp.avatar.vertex_light import posed_lighting
 from oasis_warp.avatar.wrist import shade_left
 from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import AdaptConfig

@@ -11,7 +11,8 @@ from oasis_warp.adaptation.sharpen import MIN_ALPHA, lit_as_photo
 from oasis_warp.avatar.anchors import rim_fade, vertex_to_gaussians
 from oasis_warp.avatar.densify import Densified
 from oasis_warp.avatar.observation import faded_in
-from oasis_warp.avatar.pose import pose_gaussians, posed_lighting, with_shade_baked
+from oasis_warp.avatar.pose import pose_gaussians, with_shade_baked
+from oasis_warp.avatar.vertex_light import posed_lighting
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandLight
 from oasis_warp.ops import BlendWeights, blend_colors

@@ -10,7 +10,8 @@ from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.adaptation.sh_lighting import MIN_CONFIDENCE
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.observation import observe
-from oasis_warp.avatar.pose import MIN_COLOR, posed_lighting, shading
+from oasis_warp.avatar.pose import MIN_COLOR
+from oasis_warp.avatar.vertex_light import posed_lighting, shading
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandLight
 

@@ -14,8 +14,8 @@ from torch import Tensor
 from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.avatar.anchors import rim_fade, vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.observation import Observation, observe
-from oasis_warp.avatar.pose import GAMMA, Lighting, posed_lighting, shading
 from oasis_warp.avatar.sky import arriving, harmonic_basis
+from oasis_warp.avatar.vertex_light import GAMMA, Lighting, posed_lighting, shading
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandLight

@@ -24,14 +24,8 @@ from oasis_warp.adaptation.reprojection import (
 from oasis_warp.avatar.anchors import RIM_FADE, vertex_to_gaussians
 from oasis_warp.avatar.densify import FITTED, densify, parts_for_spacing
 from oasis_warp.avatar.observation import faded_in
-from oasis_warp.avatar.pose import (
-    Lighting,
-    pose_gaussians,
-    posed_lighting,
-    shading_factors,
-    with_photo_colors,
-    with_shade_baked,
-)
+from oasis_warp.avatar.pose import pose_gaussians, shading_factors, with_photo_colors, with_shade_baked
+from oasis_warp.avatar.vertex_light import Lighting, posed_lighting
 from oasis_warp.core.camera import project
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent

@@ -5,7 +5,7 @@ import torch
 from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.observation import observe
-from oasis_warp.avatar.pose import posed_lighting, shading
+from oasis_warp.avatar.vertex_light import posed_lighting, shading
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandLight
@@ -35,8 +35,8 @@ def spread_shade(
 
     The albedo that is fitted to a photo hardly varies over more than a centimetre, but the shade does. It ended where
     the photo does, which was an edge between two tones from the side. In other poses it stayed on a palm and went from
-    the fingers. The shade of the light ends on the whole hand at once (`avatar.pose.remaining_shade`), and that of the
-    Gaussians where skin turns. The photo's view stays.
+    the fingers. The shade of the light ends on the whole hand at once (`avatar.vertex_light.remaining_shade`), and that
+    of the Gaussians where skin turns. The photo's view stays.
 
     Args:
         hand: Model of the surface.

@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float, Int
 from scipy import sparse
 from torch import Tensor
-from torch.nn.functional import pad
 
 from oasis_warp.assets import asset
 from oasis_warp.core import surface
@@ -78,7 +77,7 @@ def sky_mesh(device: torch.device) -> SkyMesh:
         weights = torch.from_numpy(stored["weights"].astype(np.float32)).to(device)
         read = Corners(corners.int(), weights)
         vertex_faces = surface.faces_of_vertices(faces, len(vertices))
-        return SkyMesh(vertices, faces, read, vertex_faces, nearby, int(stored["still"]))
+        return SkyMesh(vertices.int(), faces, read, vertex_faces, nearby.int(), int(stored["still"]))
 
 
 def _within_rings(faces: np.ndarray, count: int) -> np.ndarray:
@@ -106,18 +105,6 @@ def harmonic_basis(directions: Float[Tensor, "*B 3"], count: int) -> Float[Tenso
     return torch.cat([first, torch.stack([x * y, y * z, 3 * z * z - 1, x * z, x * x - y * y], -1)], -1)
 
 
-def radiance_harmonics(light: HandLight) -> Float[Tensor, "9 3"]:
-    """Harmonics of the light from each direction: those of irradiance without the blur of the cosine lobe."""
-    whole = pad(light.harmonics, (0, 0, 0, 9 - len(light.harmonics)))
-    return whole / _blur(whole.device).to(whole)
-
-
-@functools.cache
-def _blur(device: torch.device) -> Float[Tensor, "9 1"]:
-    with torch.inference_mode(False):
-        return torch.tensor([[LOBE[degree]] for degree in DEGREES], device=device)
-
-
 @torch.no_grad()
 def exposure(
     posed: Float[Tensor, "*B V 3"],
@@ -140,7 +127,7 @@ def exposure(
         part[..., mesh.vertices, :].float().reshape(-1, len(mesh.vertices), 3) for part in (posed, normals)
     )
     turns = quats[..., mesh.still, :].float().reshape(-1, 4)
-    found = sky_exposure(coarse, facing, mesh.faces, turns, radiance_harmonics(light).float())
+    found = sky_exposure(coarse, facing, mesh.faces, turns, light.harmonics.float())
     return read_corners(found, mesh.corners).to(posed).reshape(*batch, -1, 4)
 
 

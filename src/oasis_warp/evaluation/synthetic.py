@@ -20,8 +20,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from oasis_warp import __version__
-from oasis_warp.avatar.pose import pose_gaussians, rotate_light, with_photo
+from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.avatar.prior import Prior
+from oasis_warp.avatar.vertex_light import rotate_light, with_photo
 from oasis_warp.core.camera import camera_center
 from oasis_warp.core.config import AdaptConfig
 from oasis_warp.core.hand_model import HandModel

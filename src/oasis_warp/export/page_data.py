@@ -14,8 +14,8 @@ from torch import Tensor
 
 from oasis_warp.avatar.creases import Creases
 from oasis_warp.avatar.folds import Folds
-from oasis_warp.avatar.pose import GAMMA, SurfaceLight
 from oasis_warp.avatar.sky import sky_mesh, studio_light
+from oasis_warp.avatar.vertex_light import GAMMA, SurfaceLight
 from oasis_warp.core import surface
 from oasis_warp.core.camera import ORBIT_FIELD_OF_VIEW, ORBIT_MARGIN
 from oasis_warp.core.hand_model import HandModel

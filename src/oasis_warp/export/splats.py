@@ -45,9 +45,9 @@ DEGREE = 3
 def view_harmonics(request: ExportRequest) -> Float[Tensor, "N K 3"] | None:
     """Spherical harmonics of the colours of `posed_splats`, in axes of `y_down`; None where no view changes them.
 
-    From the photo's side they have the photo's shade, from others they have not (`avatar.pose.view_share`). The share
-    is the polynomial of degree 3 of the cosine with the narrowest lobe (Dolph and Chebyshev): 1 at the photo's side, a
-    half at 32 degrees, and at most `SIDE_LOBES` from 48 degrees on.
+    From the photo's side they have the photo's shade, from others they have not (`avatar.vertex_light.view_share`).
+    The share is the polynomial of degree 3 of the cosine with the narrowest lobe (Dolph and Chebyshev): 1 at the
+    photo's side, a half at 32 degrees, and at most `SIDE_LOBES` from 48 degrees on.
     """
     avatar, light, pose = request.avatar, request.avatar.parts.light, request.pose or request.avatar.source_pose
     if request.light == "none" or light is None or light.photo_view is None:

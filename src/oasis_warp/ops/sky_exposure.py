@@ -49,7 +49,7 @@ _SKY_EXPOSURE = Declaration(
     "sky_exposure",
     inputs={
         "vertices": Array("B V 3"), "normals": Array("B V 3"), "faces": Array("F 3", index="V"),
-        "turns": Array("B 4"), "radiance": Array("H 3"),
+        "turns": Array("B 4"), "harmonics": Array("H 3"),
     },
     public=False,
 )  # fmt: skip
@@ -61,7 +61,7 @@ def sky_exposure(
     normals: Float[Tensor, "B V 3"],
     faces: Int[Tensor, "F 3"],
     turns: Float[Tensor, "B 4"],
-    radiance: Float[Tensor, "9 3"],
+    harmonics: Float[Tensor, "H 3"],
 ) -> Float[Tensor, "B V 4"]:
     """Share of the light from all around that reaches each vertex past the surface itself: 1 where nothing hides.
 
@@ -74,7 +74,8 @@ def sky_exposure(
         normals: Unit, [B, V, 3].
         faces: Corners, [F, 3].
         turns: Unit quaternions wxyz that turn the directions, [B, 4]; as they turn with a surface, so does the result.
-        radiance: Harmonics of the light L, as in `HandLight.harmonics`, [9, 3]; below 0 there is none.
+        harmonics: 4 or 9 harmonics of irradiance, as in `HandLight`; where the light L that they stand for is below 0,
+            there is none.
 
     Returns:
         Shares under an even sky, then of the light's red, green and blue.
@@ -83,15 +84,16 @@ def sky_exposure(
         ValueError: a wrong shape, type or index.
     """
     sizes = _SKY_EXPOSURE.check(
-        {"H": 9}, vertices=vertices, normals=normals, faces=faces, turns=turns, radiance=radiance
-    )
+        {"H": 4 if len(harmonics) == 4 else 9},
+        vertices=vertices, normals=normals, faces=faces, turns=turns, harmonics=harmonics,
+    )  # fmt: skip
     batch, n, n_pairs = sizes["B"], sizes["V"], kernels.PAIRS
     index, pairs = incidence("faces", faces, n, "vertices"), _pairs(vertices.device)
-    vertices, normals, turns, radiance = contiguous(vertices, normals, turns, radiance)
+    vertices, normals, turns, harmonics = contiguous(vertices, normals, turns, harmonics)
     params = pairs._asdict() | {
         "batch": batch, "n_vertices": n, "n_faces": len(faces), "vertices": vertices, "normals": normals,
         "faces": index.table, "offsets": index.offsets, "entries": index.entries, "turns": turns,
-        "radiance": radiance, "lights": vertices.new_empty(batch, n_pairs, 2, 3),
+        "harmonics": harmonics, "n_harmonics": len(harmonics), "lights": vertices.new_empty(batch, n_pairs, 2, 3),
         "radius": vertices.new_empty(batch), "rough": vertices.new_empty(batch, n, 4),
         "out": vertices.new_empty(batch, n, 4),
     }  # fmt: skip

@@ -1,4 +1,4 @@
-// Light on the posed surface, and the colours of the Gaussians in it (avatar/pose.py): harmonics in the direction that
+// Light on the posed surface, and the colours of the Gaussians in it (avatar/vertex_light.py): harmonics in the direction that
 // skin faces, past what the hand hides of it, then the photo's shade for as long as skin faces as in the photo.
 "use strict";
 
@@ -6,7 +6,7 @@ const GAMMA = 2.2; // light is sRGB to this power, nearly
 const AS_IN_PHOTO = Math.cos((5 * Math.PI) / 180), TURNED_AWAY = Math.cos((20 * Math.PI) / 180);
 const SAME_POSE = 0.9, OTHER_POSE = 0.5; // shares of the hand that face as in the photo
 const SAME_VIEW = Math.cos((10 * Math.PI) / 180), OTHER_VIEW = Math.cos((35 * Math.PI) / 180);
-const SAME_SKY = 0.08, OTHER_SKY = 0.25; // changes of the share of the sky that skin sees, as in avatar/pose.py
+const SAME_SKY = 0.08, OTHER_SKY = 0.25; // changes of the share of the sky that skin sees, as in avatar/vertex_light.py
 const SAME_BESIDE = 0.02, OTHER_BESIDE = 0.08; // the same where the photo is in doubt
 const IN_HOLLOWS = [1, 1.2, 1.35], LEAST_LIGHT = [0.05, 0.02, 0.01]; // of light in hollows, as in avatar/sky.py
 const IN_CREVICES = [0.03, 0.012, 0.008], DEEP_INSIDE = 0.4, OUTSIDE = 0.6; // of light close to other skin, as there

@@ -1,0 +1,66 @@
+// The light of vertices on CUDA: `prepare` -> `light_vertices`.
+
+// A block for the agreement of each image with the photo, then blocks of a thread for each coarse vertex.
+__global__ void prepare(
+#include "vertex_light_parameters.inc"
+) {
+#include "../posing/vectors_cuda.h"
+    auto power = [](float x, float p) -> float { return powf(x, p); };
+#include "vertex_light.h"
+    __shared__ float sums[WARPS];
+    if (block_index < batch) {
+        float total = 0.f;
+        for (int v = threadIdx.x; in_photo && v < n_vertices; v += BLOCK)
+            total += faces_alike(get3(normals, (long long)block_index * n_vertices + v), get3(in_photo, v));
+        for (int step = 16; step > 0; step >>= 1) total += __shfl_xor_sync(0xffffffffu, total, step);
+        if (!(threadIdx.x & 31)) sums[threadIdx.x >> 5] = total;
+        __syncthreads();
+        if (threadIdx.x) return;
+        for (int w = 1; w < WARPS; w++) total += sums[w];
+        agreement[block_index] = n_vertices ? total / n_vertices : 0.f;
+        return;
+    }
+    const long long i = (long long)(block_index - batch) * BLOCK + threadIdx.x;
+    if (!seen || i >= (long long)batch * n_coarse) return;
+    const int b = (int)(i / n_coarse), c = (int)(i - (long long)b * n_coarse);
+    float most = 0.f;
+    for (int k = 0; k < n_nearby; k++) {
+        const int v = coarse[nearby[n_nearby * c + k]];
+        most = fmaxf(most, exposure[4 * ((long long)b * n_vertices + v)] - seen[v]);
+    }
+    opened[i] = most;
+}
+
+__global__ void light_vertices(
+#include "vertex_light_parameters.inc"
+) {
+#include "../posing/vectors_cuda.h"
+    auto power = [](float x, float p) -> float { return powf(x, p); };
+#include "vertex_light.h"
+    const long long at = (long long)block_index * BLOCK + threadIdx.x;
+    if (at >= (long long)batch * n_vertices) return;
+    const int b = (int)(at / n_vertices), v = (int)(at - (long long)b * n_vertices);
+    const V3 n = get3(normals, at);
+    float color[3] = {received(n, 0), received(n, 1), received(n, 2)};
+    if (exposure) {
+        const float* sky = exposure + 4 * at;
+        const float hidden = closeness ? hidden_close(sky[0], closeness[at]) : 0.f;
+        for (int c = 0; c < 3; c++) color[c] *= arrives(sky[1 + c], hidden, c);
+    }
+    for (int c = 0; c < 3; c++) color[c] = power(color[c], 1.f / gamma);
+    const int width = in_photo ? 5 : 3;
+    if (in_photo) {
+        float weak = faces_alike(n, get3(in_photo, v)), deep = weak * ramp(agreement[b], other_pose, same_pose);
+        if (seen) {
+            float near = 0.f;
+            for (int k = 0; k < 3; k++)
+                near += weights[3 * v + k] * opened[(long long)b * n_coarse + corners[3 * v + k]];
+            under_sky(more_sky(exposure[4 * at], seen[v]), near, doubt ? doubt[v] : 0.f, &deep, &weak);
+        }
+        if (viewed) deep *= viewed[b], weak *= viewed[b];
+        for (int c = 0; shade && c < 3; c++) color[c] *= 1.f + deep * (shade[3 * v + c] - 1.f);
+        out[width * at + 3] = deep;
+        out[width * at + 4] = weak;
+    }
+    for (int c = 0; c < 3; c++) out[width * at + c] = color[c];
+}

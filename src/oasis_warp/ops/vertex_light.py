@@ -1,0 +1,113 @@
+"""Light on the vertices of posed surfaces in one kernel: forty steps of torch in `avatar.vertex_light`."""
+
+import functools
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from oasis_kernels.scene import vertex_light as kernels
+from oasis_warp.ops._runtime.launch import (
+    block_count,
+    contiguous,
+    current_stream,
+    phase_state,
+    run_cuda,
+    run_native,
+    task_count,
+)
+from oasis_warp.ops.corner_reading import Corners
+
+Triple = tuple[float, float, float]
+
+
+class Rules(NamedTuple):
+    """The constants of these names in `avatar.sky` and `avatar.vertex_light`, in the order of `vertex_light.h`."""
+
+    gamma: float
+    least_light: Triple
+    in_hollows: Triple
+    in_crevices: Triple
+    deep_inside: float
+    outside: float
+    turned_away: float
+    as_in_photo: float
+    other_pose: float
+    same_pose: float
+    same_sky: float
+    other_sky: float
+    same_beside: float
+    other_beside: float
+
+
+class InPhoto(NamedTuple):
+    """What a photo shows of each vertex, as in `HandLight` and `SurfaceLight`."""
+
+    facing: Float[Tensor, "V 3"]
+    shade: Float[Tensor, "V 3"] | None
+    doubt: Float[Tensor, "V"] | None
+    seen: Float[Tensor, "V"] | None
+    """Share of the sky; None where shade does not depend on it, and without exposure."""
+
+
+class Coarse(NamedTuple):
+    """A coarse mesh over which changes of the sky spread, as `avatar.sky.SkyMesh`; indices are int32."""
+
+    vertices: Int[Tensor, "C"]
+    nearby: Int[Tensor, "C N"]
+    corners: Corners
+
+
+@torch.no_grad()
+def light_vertices(
+    normals: Float[Tensor, "B V 3"],
+    harmonics: Float[Tensor, "K 3"],
+    limits: Float[Tensor, "2 3"],
+    rules: Rules,
+    coarse: Coarse,
+    exposure: Float[Tensor, "B V 4"] | None = None,
+    albedo: Float[Tensor, "3"] | None = None,
+    closeness: Float[Tensor, "B V"] | None = None,
+    photo: InPhoto | None = None,
+    viewed: Float[Tensor, "B"] | None = None,
+) -> Float[Tensor, "B V C"]:
+    """Factors of the vertices' sRGB colours; with a `photo`, then the shares of its deep and of its weak shade.
+
+    Args are those of `avatar.vertex_light`, float32; exposure comes with the albedo. Values and indices are
+    trusted; not differentiable. The same in a batch as alone, to the bit on the CPU.
+    """
+    batch, n = normals.shape[:2]
+    params = dict(
+        zip(
+            ("normals", "harmonics", "limits", "exposure", "albedo", "closeness", "viewed", "in_photo", "shade",
+             "doubt", "seen", "corners", "weights", "coarse", "nearby"),
+            contiguous(normals, harmonics, limits, exposure, albedo, closeness, viewed, *(photo or [None] * 4),
+                       *coarse.corners, coarse.vertices, coarse.nearby),
+            strict=True,
+        )
+    )  # fmt: skip
+    n_coarse, n_nearby = coarse.nearby.shape
+    params |= {
+        "batch": batch, "n_vertices": n, "n_coarse": n_coarse, "n_nearby": n_nearby, "n_harmonics": len(harmonics),
+        "rules": _rules(rules, normals.device), "agreement": normals.new_empty(batch),
+        "opened": normals.new_empty(batch, n_coarse), "out": normals.new_empty(batch, n, 5 if photo else 3),
+    }  # fmt: skip
+    if normals.is_cuda:
+        stream = current_stream(normals.device)
+        if photo:
+            blocks = batch + block_count(batch * n_coarse, kernels.PREPARE_BLOCK)
+            run_cuda(kernels.prepare, params, blocks if batch else 0, stream)
+        run_cuda(kernels.light_vertices_cuda, params, block_count(batch * n, kernels.BLOCK), stream)
+    else:
+        params["state"] = phase_state(kernels.STATE)
+        run_native(kernels.light_vertices, params, task_count(batch * n))
+    return params["out"]
+
+
+@functools.cache
+def _rules(rules: Rules, device: torch.device) -> Float[Tensor, "R"]:
+    """Kept, because a graph must not copy them from the host."""
+    numbers = [number for value in rules for number in (value if isinstance(value, tuple) else (value,))]
+    with torch.inference_mode(False):
+        return torch.tensor(numbers, device=device)
