@@ -217,7 +217,8 @@ def exposed(meshes, harmonics=None, turns=None):
     normals = torch.stack([surface.vertex_normals(own, faces) for own in vertices])
     harmonics = (light(1.0) if harmonics is None else harmonics).to(vertices)
     turns = vertices.new_tensor([[1.0, 0, 0, 0]]).expand(len(vertices), 4) if turns is None else turns.to(vertices)
-    return sky_exposure(vertices, normals, faces, turns, harmonics)
+    members = torch.arange(vertices.shape[1], dtype=torch.int32, device=vertices.device)
+    return sky_exposure(vertices, normals, members, faces, turns, harmonics)
 
 
 def mesh(made, device):
@@ -354,4 +355,4 @@ def test_light_that_never_reaches_a_side_is_not_hidden_there(ball):
 def test_wrong_shapes_are_named(ball, as_shipped):
     vertices, faces = ball
     with pytest.raises(ValueError, match="harmonics"):
-        sky_exposure(vertices[None], vertices[None], faces, torch.eye(4)[:1], torch.ones(5, 3))
+        sky_exposure(vertices[None], vertices[None], torch.arange(5), faces[:0], torch.eye(4)[:1], torch.ones(5, 3))

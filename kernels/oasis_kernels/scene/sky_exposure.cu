@@ -1,29 +1,34 @@
-// Sky exposure on CUDA, by the rules of `sky_exposure.cpp`: `draw` -> `gather` -> `smooth`. A block draws a pair of
-// directions into shared memory, where depths are whole numbers in the same order.
+// Sky exposure on CUDA, by the rules of `sky_exposure.cpp`: `draw` -> `gather` -> `smooth`. A block draws every
+// `SLICES`th face, as a pair of directions sees it, into shared memory, where depths are whole numbers in the same
+// order.
 
 __global__ void draw(
 #include "sky_parameters.inc"
-    float* middle,  // [B, 3], scratch: of the box around the vertices, in the axes that turn with the surface
-    float* buffers  // [B, P, 2, SIZE, SIZE], scratch: nearest and farthest depths
+    int n_points,        // W
+    const int* members,  // [V]: the vertices that are looked at, among W
+    float* middle,       // [B, 3], scratch: of the box around the vertices, in the axes that turn with the surface
+    float* buffers       // [B, P, SLICES, 2, SIZE, SIZE], scratch: nearest and farthest depths
 ) {
 #include "sky_light.h"
     __shared__ int nearest[SIZE * SIZE], farthest[SIZE * SIZE];
     __shared__ float reduced[WARPS][6];
     __shared__ float box[6];
     const float FAR = 1e30f;
-    const int b = block_index / PAIRS, k = block_index - PAIRS * b, lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
-    const float* points = vertices + 3ll * b * n_vertices;
+    const int pair = block_index / SLICES, slice = block_index - SLICES * pair, b = pair / PAIRS, k = pair - PAIRS * b;
+    const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
+    const float* points = vertices + 3ll * b * n_points;
     float m[9];
     matrix_of(turns + 4 * b, m);
-    if (threadIdx.x < 2)
-        light_from(m, axes + 9 * k + 6, threadIdx.x ? 1.f : -1.f, lights + 3 * (2 * block_index + threadIdx.x));
+    if (!slice && threadIdx.x < 2)
+        light_from(m, axes + 9 * k + 6, threadIdx.x ? 1.f : -1.f, lights + 3 * (2 * pair + threadIdx.x));
     // The same order as the depths that they stand for, both ways.
     auto ordered = [](float x) -> int {
         const int bits = __float_as_int(x);
         return bits < 0 ? bits ^ 0x7fffffff : bits;
     };
     auto depth_of = [](int key) -> float { return __int_as_float(key < 0 ? key ^ 0x7fffffff : key); };
-    auto turned = [&](const float* p, float* to) {
+    auto turned = [&](int vertex, float* to) {
+        const float* p = points + 3 * members[vertex];
         for (int j = 0; j < 3; j++) to[j] = m[j] * p[0] + m[3 + j] * p[1] + m[6 + j] * p[2];
     };
     auto over_block = [&](float* values, int n) {  // the largest of each, in `box`
@@ -43,7 +48,7 @@ __global__ void draw(
 
     float values[6] = {-FAR, -FAR, -FAR, -FAR, -FAR, -FAR}, own[3];
     for (int i = threadIdx.x; i < n_vertices; i += BLOCK) {
-        turned(points + 3 * i, own);
+        turned(i, own);
         for (int j = 0; j < 3; j++) {
             values[j] = fmaxf(values[j], own[j]);
             values[3 + j] = fmaxf(values[3 + j], -own[j]);
@@ -55,14 +60,14 @@ __global__ void draw(
     __syncthreads();
     values[0] = 0.f;
     for (int i = threadIdx.x; i < n_vertices; i += BLOCK) {
-        turned(points + 3 * i, own);
+        turned(i, own);
         float square = 0.f;
         for (int j = 0; j < 3; j++) square += (own[j] - center[j]) * (own[j] - center[j]);
         values[0] = fmaxf(values[0], square);
     }
     over_block(values, 1);
     const float reach = MARGIN * sqrtf(box[0]), texel = reach * (2.f / SIZE), scale = texel > 0.f ? 1.f / texel : 0.f;
-    if (!k && !threadIdx.x) {
+    if (!k && !slice && !threadIdx.x) {
         radius[b] = reach;
         for (int j = 0; j < 3; j++) middle[3 * b + j] = center[j];
     }
@@ -74,7 +79,7 @@ __global__ void draw(
     __syncthreads();
     const float* axis = axes + 9 * k;
     auto placed = [&](int vertex, float* to) {
-        turned(points + 3 * vertex, own);
+        turned(vertex, own);
         for (int j = 0; j < 3; j++) {
             float at = 0.f;
             for (int c = 0; c < 3; c++) at += axis[3 * j + c] * (own[c] - center[c]);
@@ -82,7 +87,7 @@ __global__ void draw(
         }
     };
     auto clamped = [](float x, float low, float high) -> int { return (int)fminf(fmaxf(x, low), high); };
-    for (int f = threadIdx.x; f < n_faces; f += BLOCK) {
+    for (int f = SLICES * threadIdx.x + slice; f < n_faces; f += SLICES * BLOCK) {
         float p[3][3];
         for (int j = 0; j < 3; j++) placed(faces[3 * f + j], p[j]);
         const int left = clamped(ceilf(fminf(p[0][0], fminf(p[1][0], p[2][0]))), 0.f, SIZE);
@@ -113,8 +118,10 @@ __global__ void draw(
 
 __global__ void gather(
 #include "sky_parameters.inc"
-    const float* middle,  // [B, 3], from `draw`
-    const float* buffers  // [B, P, 2, SIZE, SIZE], from `draw`
+    int n_points,
+    const int* members,
+    const float* middle,  // from `draw`
+    const float* buffers  // likewise
 ) {
 #include "sky_light.h"
     const long long i = (long long)block_index * (BLOCK / PAIRS) + threadIdx.x / PAIRS;
@@ -123,7 +130,8 @@ __global__ void gather(
     float sums[8] = {0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f};  // seen, then all
     if (there) {
         const int b = (int)(i / n_vertices);
-        const float *p = vertices + 3 * i, *n = normals + 3 * i, *axis = axes + 9 * k;
+        const long long at_point = (long long)b * n_points + members[i - (long long)b * n_vertices];
+        const float *p = vertices + 3 * at_point, *n = normals + 3 * at_point, *axis = axes + 9 * k;
         float m[9];
         matrix_of(turns + 4 * b, m);
         const float texel = radius[b] * (2.f / SIZE), scale = texel > 0.f ? 1.f / texel : 0.f;
@@ -143,12 +151,16 @@ __global__ void gather(
         const float v = (at[1] + LIFT * tilt[1]) * scale + (SIZE / 2 - .5f);
         const float column = floorf(fminf(fmaxf(u, -1.f), SIZE)), row = floorf(fminf(fmaxf(v, -1.f), SIZE));
         const float part_x = u - column, part_y = v - row;
-        const float* buffer = buffers + (2ll * (b * PAIRS + k) + (cosine > 0.f ? 0 : 1)) * SIZE * SIZE;
+        const float* buffer = buffers + (2ll * (b * PAIRS + k) * SLICES + (cosine > 0.f ? 0 : 1)) * SIZE * SIZE;
         float share = 0.f;
         for (int j = 0; j < 4; j++) {
             const int x = (int)fminf(fmaxf(column + j % 2, 0.f), SIZE - 1);
             const int y = (int)fminf(fmaxf(row + j / 2, 0.f), SIZE - 1);
-            const float hides = buffer[SIZE * y + x], gap = cosine > 0.f ? hides - depth : depth - hides;
+            float gap = 1e30f;
+            for (int slice = 0; slice < SLICES; slice++) {
+                const float hides = buffer[2 * SIZE * SIZE * slice + SIZE * y + x];
+                gap = fminf(gap, cosine > 0.f ? hides - depth : depth - hides);
+            }
             const float weight = (j % 2 ? part_x : 1.f - part_x) * (j / 2 ? part_y : 1.f - part_y);
             share += weight * fminf(fmaxf((gap + bias) * (1.f / LIFT) + 1.f, 0.f), 1.f);
         }
@@ -166,15 +178,18 @@ __global__ void gather(
 __global__ void smooth(
 #include "sky_parameters.inc"
 ) {
-    const long long i = (long long)block_index * BLOCK + threadIdx.x;
-    if (i >= (long long)batch * n_vertices) return;
-    const long long b = i / n_vertices;
-    const int v = (int)(i - b * n_vertices), begin = offsets[v], count = offsets[v + 1] - begin;
+    const long long i = (long long)block_index * (BLOCK / LANES) + threadIdx.x / LANES;
+    const bool there = i < (long long)batch * n_vertices;
+    const long long b = there ? i / n_vertices : 0;
+    const int v = there ? (int)(i - b * n_vertices) : 0, begin = offsets[v], count = offsets[v + 1] - begin;
+    const int lane = threadIdx.x % LANES;
     float total[4] = {0.f, 0.f, 0.f, 0.f};
-    for (int e = begin; e < begin + count; e++)
+    for (int e = lane; there && e < count; e += LANES)
         for (int j = 0; j < 3; j++) {
-            const float* other = rough + 4 * (b * n_vertices + faces[3 * (entries[e] / 3) + j]);
+            const float* other = rough + 4 * (b * n_vertices + faces[3 * (entries[begin + e] / 3) + j]);
             for (int c = 0; c < 4; c++) total[c] += other[c];
         }
-    for (int c = 0; c < 4; c++) out[4 * i + c] = count ? total[c] * (1.f / (3.f * count)) : rough[4 * i + c];
+    for (int step = LANES / 2; step > 0; step >>= 1)
+        for (int c = 0; c < 4; c++) total[c] += __shfl_xor_sync(0xffffffffu, total[c], step);
+    if (there && lane < 4) out[4 * i + lane] = count ? total[lane] * (1.f / (3.f * count)) : rough[4 * i + lane];
 }

@@ -17,11 +17,13 @@ PAIRS = 16
 """Pairs of opposite directions."""
 SLACK = 1e-4
 """Share of a face by which a pixel may lie outside: rounding must open no seam between two faces."""
+SLICES, LANES = 4, 8
+"""On CUDA: blocks that share the faces of a pair of directions, threads that share the faces around a vertex."""
 STATE = 4 * PHASE_WORDS
 """Words of zeros that threads on the CPU share."""
 CONSTANTS = {
     "SIZE": SIZE, "MARGIN": f"{MARGIN}f", "LIFT": f"{LIFT}f", "STEEPEST": f"{STEEPEST}f", "LEAST": f"{LEAST}f",
-    "PAIRS": PAIRS, "SLACK": f"{SLACK}f",
+    "PAIRS": PAIRS, "SLACK": f"{SLACK}f", "SLICES": SLICES, "LANES": LANES,
 }  # fmt: skip
 DRAW_BLOCK, VERTEX_BLOCK = 1024, 128
 """Threads of a block."""
@@ -34,8 +36,8 @@ def _on_cuda(name: str, block: int) -> CudaNative:
 
 
 draw = _on_cuda("draw", DRAW_BLOCK)
-"""Kernel: a block for each pair of directions of each image."""
+"""Kernel: `SLICES` blocks for each pair of directions of each image."""
 gather = _on_cuda("gather", VERTEX_BLOCK)
 """Kernel: `PAIRS` threads for each vertex of each image."""
 smooth = _on_cuda("smooth", VERTEX_BLOCK)
-"""Kernel: a thread for each vertex of each image."""
+"""Kernel: `LANES` threads for each vertex of each image."""

@@ -1,6 +1,6 @@
 // The light of vertices on CUDA: `prepare` -> `light_vertices`.
 
-// A block for the agreement of each image with the photo, then blocks of a thread for each coarse vertex.
+// `PARTS` blocks for the agreement of each image with the photo, then a warp for each coarse vertex.
 __global__ void prepare(
 #include "vertex_light_parameters.inc"
 ) {
@@ -8,27 +8,30 @@ __global__ void prepare(
     auto power = [](float x, float p) -> float { return powf(x, p); };
 #include "vertex_light.h"
     __shared__ float sums[WARPS];
-    if (block_index < batch) {
+    const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
+    if (block_index < PARTS * batch) {
+        const int b = block_index / PARTS, first = (block_index - PARTS * b) * BLOCK + threadIdx.x;
         float total = 0.f;
-        for (int v = threadIdx.x; in_photo && v < n_vertices; v += BLOCK)
-            total += faces_alike(get3(normals, (long long)block_index * n_vertices + v), get3(in_photo, v));
+        for (int v = first; in_photo && v < n_vertices; v += PARTS * BLOCK)
+            total += faces_alike(get3(normals, (long long)b * n_vertices + v), get3(in_photo, v));
         for (int step = 16; step > 0; step >>= 1) total += __shfl_xor_sync(0xffffffffu, total, step);
-        if (!(threadIdx.x & 31)) sums[threadIdx.x >> 5] = total;
+        if (!lane) sums[warp] = total;
         __syncthreads();
         if (threadIdx.x) return;
         for (int w = 1; w < WARPS; w++) total += sums[w];
-        agreement[block_index] = n_vertices ? total / n_vertices : 0.f;
+        agreement[block_index] = total / n_vertices;
         return;
     }
-    const long long i = (long long)(block_index - batch) * BLOCK + threadIdx.x;
+    const long long i = (long long)(block_index - PARTS * batch) * WARPS + warp;
     if (!seen || i >= (long long)batch * n_coarse) return;
     const int b = (int)(i / n_coarse), c = (int)(i - (long long)b * n_coarse);
     float most = 0.f;
-    for (int k = 0; k < n_nearby; k++) {
+    for (int k = lane; k < n_nearby; k += 32) {
         const int v = coarse[nearby[n_nearby * c + k]];
         most = fmaxf(most, exposure[4 * ((long long)b * n_vertices + v)] - seen[v]);
     }
-    opened[i] = most;
+    for (int step = 16; step > 0; step >>= 1) most = fmaxf(most, __shfl_xor_sync(0xffffffffu, most, step));
+    if (!lane) opened[i] = most;
 }
 
 __global__ void light_vertices(
@@ -50,7 +53,9 @@ __global__ void light_vertices(
     for (int c = 0; c < 3; c++) color[c] = power(color[c], 1.f / gamma);
     const int width = in_photo ? 5 : 3;
     if (in_photo) {
-        float weak = faces_alike(n, get3(in_photo, v)), deep = weak * ramp(agreement[b], other_pose, same_pose);
+        float alike = 0.f;
+        for (int part = 0; part < PARTS; part++) alike += agreement[PARTS * b + part];
+        float weak = faces_alike(n, get3(in_photo, v)), deep = weak * ramp(alike, other_pose, same_pose);
         if (seen) {
             float near = 0.f;
             for (int k = 0; k < 3; k++)

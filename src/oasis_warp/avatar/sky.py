@@ -123,11 +123,9 @@ def exposure(
         light: Any; what of it does not arrive bounces.
     """
     mesh, batch = sky_mesh(posed.device), posed.shape[:-2]
-    coarse, facing = (
-        part[..., mesh.vertices, :].float().reshape(-1, len(mesh.vertices), 3) for part in (posed, normals)
-    )
+    surface, facing = (part.float().reshape(-1, *part.shape[-2:]) for part in (posed, normals))
     turns = quats[..., mesh.still, :].float().reshape(-1, 4)
-    found = sky_exposure(coarse, facing, mesh.faces, turns, light.harmonics.float())
+    found = sky_exposure(surface, facing, mesh.vertices, mesh.faces, turns, light.harmonics.float())
     return read_corners(found, mesh.corners).to(posed).reshape(*batch, -1, 4)
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from oasis_kernels.scene import sky_exposure as kernels
 from oasis_warp.ops._runtime.declaration import Array, Declaration
-from oasis_warp.ops._runtime.incidence import incidence
+from oasis_warp.ops._runtime.incidence import checked_indices, incidence
 from oasis_warp.ops._runtime.launch import block_count, contiguous, current_stream, phase_state, run_cuda, run_native
 
 
@@ -48,7 +48,8 @@ def sky_directions(device: torch.device) -> Sky:
 _SKY_EXPOSURE = Declaration(
     "sky_exposure",
     inputs={
-        "vertices": Array("B V 3"), "normals": Array("B V 3"), "faces": Array("F 3", index="V"),
+        "vertices": Array("B W 3"), "normals": Array("B W 3"), "members": Array("V", index="W"),
+        "faces": Array("F 3", index="V"),
         "turns": Array("B 4"), "harmonics": Array("H 3"),
     },
     public=False,
@@ -57,8 +58,9 @@ _SKY_EXPOSURE = Declaration(
 
 @torch.no_grad()
 def sky_exposure(
-    vertices: Float[Tensor, "B V 3"],
-    normals: Float[Tensor, "B V 3"],
+    vertices: Float[Tensor, "B W 3"],
+    normals: Float[Tensor, "B W 3"],
+    members: Int[Tensor, "V"],
     faces: Int[Tensor, "F 3"],
     turns: Float[Tensor, "B 4"],
     harmonics: Float[Tensor, "H 3"],
@@ -70,9 +72,10 @@ def sky_exposure(
     same on every device and in a batch as alone up to rounding; to the bit on the CPU.
 
     Args:
-        vertices: Vertices of posed surfaces [m], float32, [B, V, 3].
-        normals: Unit, [B, V, 3].
-        faces: Corners, [F, 3].
+        vertices: Vertices of posed surfaces [m], float32, [B, W, 3].
+        normals: Unit, [B, W, 3].
+        members: The vertices that hide the sky and look at it, int32, [V].
+        faces: Corners, as numbers of `members`, [F, 3].
         turns: Unit quaternions wxyz that turn the directions, [B, 4]; as they turn with a surface, so does the result.
         harmonics: 4 or 9 harmonics of irradiance, as in `HandLight`; where the light L that they stand for is below 0,
             there is none.
@@ -85,10 +88,11 @@ def sky_exposure(
     """
     sizes = _SKY_EXPOSURE.check(
         {"H": 4 if len(harmonics) == 4 else 9},
-        vertices=vertices, normals=normals, faces=faces, turns=turns, harmonics=harmonics,
+        vertices=vertices, normals=normals, members=members, faces=faces, turns=turns, harmonics=harmonics,
     )  # fmt: skip
     batch, n, n_pairs = sizes["B"], sizes["V"], kernels.PAIRS
-    index, pairs = incidence("faces", faces, n, "vertices"), _pairs(vertices.device)
+    index, pairs = incidence("faces", faces, n, "members"), _pairs(vertices.device)
+    members = checked_indices("members", members, sizes["W"], "vertices")
     vertices, normals, turns, harmonics = contiguous(vertices, normals, turns, harmonics)
     params = pairs._asdict() | {
         "batch": batch, "n_vertices": n, "n_faces": len(faces), "vertices": vertices, "normals": normals,
@@ -99,12 +103,14 @@ def sky_exposure(
     }  # fmt: skip
     if vertices.is_cuda:
         size, stream = kernels.SIZE, current_stream(vertices.device)
-        params["middle"] = vertices.new_empty(batch, 3)
-        params["buffers"] = vertices.new_empty(batch, n_pairs, 2, size, size)
-        run_cuda(kernels.draw, params, batch * n_pairs if n else 0, stream)
+        blocks = batch * n_pairs * kernels.SLICES
+        params |= {"n_points": sizes["W"], "members": members, "middle": vertices.new_empty(batch, 3)}
+        params["buffers"] = vertices.new_empty(blocks, 2, size, size)
+        run_cuda(kernels.draw, params, blocks if n else 0, stream)
         run_cuda(kernels.gather, params, block_count(batch * n * n_pairs, kernels.VERTEX_BLOCK), stream)
-        run_cuda(kernels.smooth, params, block_count(batch * n, kernels.VERTEX_BLOCK), stream)
+        run_cuda(kernels.smooth, params, block_count(batch * n * kernels.LANES, kernels.VERTEX_BLOCK), stream)
         return params["out"]
+    params |= {name: params[name].index_select(1, members) for name in ("vertices", "normals")}
     width = -(-n // 16) * 16
     scratch = vertices.new_empty(batch, 6 + 4 * n_pairs, width)
     own, screen, shares = scratch.flatten().split([batch * rows * width for rows in (6, 3 * n_pairs, n_pairs)])

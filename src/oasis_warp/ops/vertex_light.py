@@ -90,14 +90,14 @@ def light_vertices(
     n_coarse, n_nearby = coarse.nearby.shape
     params |= {
         "batch": batch, "n_vertices": n, "n_coarse": n_coarse, "n_nearby": n_nearby, "n_harmonics": len(harmonics),
-        "rules": _rules(rules, normals.device), "agreement": normals.new_empty(batch),
+        "rules": _rules(rules, normals.device), "agreement": normals.new_empty(batch, kernels.PARTS),
         "opened": normals.new_empty(batch, n_coarse), "out": normals.new_empty(batch, n, 5 if photo else 3),
     }  # fmt: skip
     if normals.is_cuda:
         stream = current_stream(normals.device)
         if photo:
-            blocks = batch + block_count(batch * n_coarse, kernels.PREPARE_BLOCK)
-            run_cuda(kernels.prepare, params, blocks if batch else 0, stream)
+            blocks = batch * kernels.PARTS + block_count(batch * n_coarse * 32, kernels.PREPARE_BLOCK)
+            run_cuda(kernels.prepare, params, blocks if n else 0, stream)
         run_cuda(kernels.light_vertices_cuda, params, block_count(batch * n, kernels.BLOCK), stream)
     else:
         params["state"] = phase_state(kernels.STATE)
