@@ -4,11 +4,13 @@ import torch
 
 from oasis_warp.ops.blend_weights import blend_weights
 from oasis_warp.ops.contact import ContactTables, contact_shifts
+from oasis_warp.ops.corner_reading import Corners, read_corners
 from oasis_warp.ops.face_rotations import face_rotations
 from oasis_warp.ops.mesh_posing import pose_on_mesh
 from oasis_warp.ops.rasterization import rasterization
 from oasis_warp.ops.skinning import skin
 from oasis_warp.ops.sky_exposure import sky_exposure
+from oasis_warp.ops.vertex_light import Coarse, InPhoto, Rules, light_vertices
 from oasis_warp.ops.visibility import depth_visibility
 
 
@@ -31,8 +33,12 @@ def warm_up(device: torch.device | str = "cpu") -> None:
         turned = face_rotations(vertices, vertices, faces)
         each = torch.arange(4, device=device)
         posed = pose_on_mesh(vertices, faces, each, thirds, turned.vertex_quats, turned.area_ratio, quats, scales)
-        sky_exposure(vertices[None], vertices[None], faces, quats[:1], ones.new_ones(9, 3))
         each, none = each.int(), each[:1, None].int()
+        sky = sky_exposure(vertices[None], vertices[None], each, faces, quats[:1], ones.new_ones(9, 3))
+        coarse = Coarse(each, each[:, None], Corners(each[:, None].expand(4, 3), thirds))
+        rules, photo = Rules(1.0, *[(1.0, 1.0, 1.0)] * 3, *map(float, range(10))), InPhoto(vertices, None, None, ones)
+        read_corners(sky, coarse.corners)
+        light_vertices(vertices[None], scales, scales[:2], rules, coarse, sky, ones[:3], photo=photo)
         whole = ContactTables(each, 4 * each[:2], 0 * each, none, none, none, ones, 4 * each, each, ones)
         contact_shifts(vertices[None], faces, whole, False)
         depth_visibility(vertices, vertices, faces, K, viewmat, 16, 16)
