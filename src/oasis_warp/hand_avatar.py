@@ -9,8 +9,8 @@ from torch import Tensor
 
 from oasis_warp.avatar.anchors import gaussian_corners
 from oasis_warp.avatar.creases import Creases, find_creases
-from oasis_warp.avatar.folds import Folds, find_folds, open_folds
-from oasis_warp.avatar.pose import in_even_light, pose_gaussians
+from oasis_warp.avatar.folds import Folds, find_folds
+from oasis_warp.avatar.pose import Bend, in_even_light, pose_gaussians
 from oasis_warp.avatar.sky import NOTHING_HIDDEN
 from oasis_warp.avatar.vertex_light import (
     GAMMA,
@@ -230,10 +230,12 @@ class Avatar:
                 check_finite(viewmat=camera.viewmat)
             center = camera_center(camera.viewmat.to(self.shape))
         posed = self._resolve_contact(skin_surface(self._model, self._rest, checked), checked)
-        opening = None if self._folds is None else open_folds(self._folds, checked.angles)
+        bend = None
+        if self._folds is not None and self._creases is not None:
+            bend = Bend(self._folds, checked.angles, self._creases)
         return pose_gaussians(
-            self._canonical, self.hand.faces, self._rest_mesh, posed.vertices, self._light, center, opening,
-            posed.closeness, self._creases,
+            self._canonical, self.hand.faces, self._rest_mesh, posed.vertices, self._light, center, bend,
+            posed.closeness,
         )  # fmt: skip
 
     @torch.no_grad()

@@ -89,9 +89,8 @@ void light_vertices(
             float columns[5][16];
             for (int c = 0; c < 3; c++) store(columns[c], color[c]);
             store(columns[3], deep), store(columns[4], weak);
-            const int width = in_photo ? 5 : 3;
             for (int lane = 0; lane < count; lane++)
-                for (int c = 0; c < width; c++) out[width * (at + lane) + c] = columns[c][lane];
+                for (int c = 0; c < 5; c++) out[5 * (at + lane) + c] = columns[c][lane];
         }
     });
 }

@@ -51,11 +51,12 @@ __global__ void light_vertices(
         for (int c = 0; c < 3; c++) color[c] *= arrives(sky[1 + c], hidden, c);
     }
     for (int c = 0; c < 3; c++) color[c] = power(color[c], 1.f / gamma);
-    const int width = in_photo ? 5 : 3;
+    float deep = 0.f, weak = 0.f;
     if (in_photo) {
         float alike = 0.f;
         for (int part = 0; part < PARTS; part++) alike += agreement[PARTS * b + part];
-        float weak = faces_alike(n, get3(in_photo, v)), deep = weak * ramp(alike, other_pose, same_pose);
+        weak = faces_alike(n, get3(in_photo, v));
+        deep = weak * ramp(alike, other_pose, same_pose);
         if (seen) {
             float near = 0.f;
             for (int k = 0; k < 3; k++)
@@ -64,8 +65,8 @@ __global__ void light_vertices(
         }
         if (viewed) deep *= viewed[b], weak *= viewed[b];
         for (int c = 0; shade && c < 3; c++) color[c] *= 1.f + deep * (shade[3 * v + c] - 1.f);
-        out[width * at + 3] = deep;
-        out[width * at + 4] = weak;
     }
-    for (int c = 0; c < 3; c++) out[width * at + c] = color[c];
+    for (int c = 0; c < 3; c++) out[5 * at + c] = color[c];
+    out[5 * at + 3] = deep;
+    out[5 * at + 4] = weak;
 }

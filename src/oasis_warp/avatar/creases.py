@@ -14,7 +14,7 @@ from torch.nn.functional import pad
 
 from oasis_warp.avatar.anchors import gaussian_corners, vertex_colors, vertex_to_gaussians
 from oasis_warp.avatar.appearance import skin_regions
-from oasis_warp.avatar.folds import LEAST, MIN_COLOR, Folds, beyond_shallow, edges_among, ink_share
+from oasis_warp.avatar.folds import LEAST, MIN_COLOR, Folds, beyond_shallow, edges_among, ink_share, rows_of
 from oasis_warp.avatar.sky import sky_mesh
 from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
@@ -37,6 +37,8 @@ class Creases(NamedTuple):
 
     index: Int[Tensor, "M"]
     """Their numbers among all."""
+    row: Int[Tensor, "N"]
+    """Place of each Gaussian in `index`, -1 for none; int32."""
     corners: Corners
     """Vertices around each."""
     change: Float[Tensor, "M 3"]
@@ -75,7 +77,7 @@ def find_creases(
     beyond = gaussians.colors[index].clamp_min(MIN_COLOR).log() - read[index, :3]
     corners = Corners(*(part[index] for part in gaussian_corners(hand.faces, gaussians)))
     change = -beyond_shallow(beyond, SHALLOW) * read[index, 3:]
-    return Creases(index, corners, change, _coarse_areas(photo))
+    return Creases(index, rows_of(index, len(read)), corners, change, _coarse_areas(photo))
 
 
 @functools.lru_cache(4)

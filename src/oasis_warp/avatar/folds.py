@@ -58,6 +58,8 @@ class Folds(NamedTuple):
 
     index: Int[Tensor, "M"]
     """Their numbers among all."""
+    row: Int[Tensor, "N"]
+    """Place of each Gaussian in `index`, -1 for none; int32."""
     joints: Int[Tensor, "M 2"]
     """The joints that open each, as rows of `HandPose.angles`; over a finger twice the same."""
     between: Float[Tensor, "M 1"]
@@ -181,13 +183,20 @@ def find_folds(
     over = joint.joint[first]
     return Folds(
         index=index,
-        joints=torch.where(over[:, None] < 0, back.joints[first], over[:, None]),
+        row=rows_of(index, len(like)),
+        joints=torch.where(over[:, None] < 0, back.joints[first], over[:, None]).int(),
         between=back.between[first, None],
         change=change[index],
         painted=painted[index],
         straight=-hand.rest_bend[1:].to(angles),
         photo=angles[:, 0],
     )
+
+
+def rows_of(index: Int[Tensor, "M"], count: int) -> Int[Tensor, "N"]:
+    """Place of each of `count` numbers in `index`, -1 for none."""
+    rows = torch.arange(len(index), dtype=torch.int32, device=index.device)
+    return rows.new_full((count,), -1).index_copy(0, index, rows)
 
 
 def _skin_around_folds(skin: _JointSkin, logs: Float[Tensor, "S 3"]) -> Float[Tensor, "S 4"]:
@@ -233,6 +242,17 @@ class Opening(NamedTuple):
     """The same for what is painted, which may be open in the photo's pose: added where the photo's shade is gone."""
 
 
+def opened_by_joints(folds: Folds, angles: Float[Tensor, "*B J 3"]) -> Float[Tensor, "*B J 2"]:
+    """How far bent joints open folds that the photo shows, and painted ones, 0 to 1.
+
+    Args:
+        folds: By `find_folds`.
+        angles: Joint angles [rad].
+    """
+    beyond = torch.stack([angles[..., 0] - folds.photo, angles[..., 0] - folds.straight], -1)
+    return ((beyond - CLOSED) / (OPENED - CLOSED)).clamp(0, 1)
+
+
 def open_folds(folds: Folds, angles: Float[Tensor, "*B J 3"]) -> Opening:
     """What bent joints add to the colours of folds.
 
@@ -240,8 +260,7 @@ def open_folds(folds: Folds, angles: Float[Tensor, "*B J 3"]) -> Opening:
         folds: By `find_folds`.
         angles: Joint angles [rad].
     """
-    beyond = torch.stack([angles[..., 0] - folds.photo, angles[..., 0] - folds.straight], -1)
-    opened = ((beyond - CLOSED) / (OPENED - CLOSED)).clamp(0, 1)[..., folds.joints, :]
+    opened = opened_by_joints(folds, angles)[..., folds.joints, :]
     of_photo, of_straight = torch.lerp(*opened.unbind(-2), folds.between).split(1, -1)
     seen, painted = of_photo * (1 - folds.painted), of_straight * folds.painted
     return Opening(folds.index, seen, seen * folds.change, painted * folds.change)

@@ -1,12 +1,14 @@
 """Canonical Gaussians in a pose and in a light; no network, no image."""
 
+from typing import NamedTuple
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from oasis_warp.avatar.anchors import gaussian_corners
-from oasis_warp.avatar.creases import Creases, flat_creases
-from oasis_warp.avatar.folds import Opening
+from oasis_warp.avatar.creases import Creases, flat_creases, flat_share
+from oasis_warp.avatar.folds import Folds, Opening, open_folds, opened_by_joints
 from oasis_warp.avatar.vertex_light import (
     GAMMA,
     Lighting,
@@ -19,6 +21,7 @@ from oasis_warp.avatar.vertex_light import (
 from oasis_warp.core.types import CanonicalGaussians, Gaussians, HandLight
 from oasis_warp.ops import RestMesh, pose_mesh_gaussians
 from oasis_warp.ops.corner_reading import Corners, read_corners
+from oasis_warp.ops.gaussian_light import FlatCreases, OpenFolds, light_gaussians
 
 WEAK, DEEP = 0.3, 0.6
 """Differences of shade from 1 up to which it is relief or tone of the skin itself, and from which it is a sharp shadow,
@@ -33,31 +36,40 @@ MIN_COLOR = 1e-3
 """Least colour that has shade: it is a factor."""
 
 
+class Bend(NamedTuple):
+    """What bent joints and stretched skin change in the colours of an avatar's Gaussians."""
+
+    folds: Folds
+    angles: Float[Tensor, "*B J 3"]
+    """Of the joints [rad]."""
+    creases: Creases
+
+
 def shading_factors(
     canonical: CanonicalGaussians,
     faces: Int[Tensor, "F 3"],
     light: HandLight,
     on: Lighting,
     seen: Float[Tensor, "V"] | None = None,
-    viewed: Float[Tensor, "*B"] | None = None,
-    opening: Opening | None = None,
-    corners: Corners | None = None,
 ) -> Float[Tensor, "*B N 3"]:
-    """Factors by which `light`, and the `opening` of folds, multiply the colours of Gaussians.
+    """Factors by which `light` multiplies the colours of Gaussians; without `seen` those in the photo itself."""
+    return _factors(canonical, vertex_light(light, on, seen), gaussian_corners(faces, canonical))
 
-    Without `seen` those in the photo itself; `viewed` is the `view_share`, 1 if not given. Painted folds are as in
-    the photo as far as its weak shade stays. The `corners` are those of all Gaussians, found if not given.
-    """
-    if corners is None:
-        corners = gaussian_corners(faces, canonical)
-    of_vertices = vertex_light(light, on, seen, viewed)
-    if light.facing is None:
-        return _opened(read_corners(of_vertices, corners), opening)
+
+def _factors(
+    canonical: CanonicalGaussians,
+    of_vertices: Float[Tensor, "*B V 5"],
+    corners: Corners,
+    opening: Opening | None = None,
+) -> Float[Tensor, "*B N 3"]:
+    """The same, given the `vertex_light`, and what an `opening` of folds multiplies."""
     if canonical.shade is None and opening is None:
         return read_corners(of_vertices[..., :3], corners)
     read = read_corners(of_vertices, corners)
-    of_deep, of_weak = read[..., 3:4], read[..., 4:]
-    factors = _opened(read[..., :3], opening, of_weak)
+    factors, of_deep, of_weak = read.split([3, 1, 1], -1)
+    if opening is not None:  # painted folds are as in the photo as far as its weak shade stays
+        gone = 1 - of_weak.index_select(-2, opening.index)
+        factors = _times_exp(factors, opening.index, opening.logs + opening.painted * gone)
     if canonical.shade is None:
         return factors
     if opening is not None:
@@ -67,19 +79,51 @@ def shading_factors(
     return factors * (1 + torch.lerp(of_weak, of_deep, deep) * beyond)
 
 
-def _opened(
-    factors: Float[Tensor, "*B N 3"], opening: Opening | None, stays: Float[Tensor, "*B N 1"] | None = None
-) -> Float[Tensor, "*B N 3"]:
-    if opening is None:
-        return factors
-    gone = 1 if stays is None else 1 - stays.index_select(-2, opening.index)
-    return _times_exp(factors, opening.index, opening.logs + opening.painted * gone)
-
-
 def _times_exp(
     factors: Float[Tensor, "*B N 3"], index: Int[Tensor, "M"], logs: Float[Tensor, "*B M 3"]
 ) -> Float[Tensor, "*B N 3"]:
     return factors.index_copy(-2, index, factors.index_select(-2, index) * logs.exp())
+
+
+def lit_in_steps(
+    canonical: CanonicalGaussians,
+    of_vertices: Float[Tensor, "*B V 5"],
+    corners: Corners,
+    bend: Bend | None,
+    posed: Float[Tensor, "*B V 3"],
+) -> Float[Tensor, "*B N 3"]:
+    """The colours of Gaussians under the `vertex_light` of the vertices around them, their `corners`.
+
+    In a `bend`, folds over bent joints are open, and creases in stretched skin of the `posed` surface are flat.
+    """
+    opening = None if bend is None else open_folds(bend.folds, bend.angles)
+    factors = _factors(canonical, of_vertices, corners, opening)
+    if bend is not None:
+        factors = _times_exp(factors, bend.creases.index, flat_creases(bend.creases, posed))
+    return (canonical.colors * factors).clamp(0, 1)
+
+
+def lit(
+    canonical: CanonicalGaussians, of_vertices: Float[Tensor, "*B V 5"], corners: Corners, bend: Bend | None,
+    posed: Float[Tensor, "*B V 3"],
+) -> Float[Tensor, "*B N 3"]:  # fmt: skip
+    """`lit_in_steps`, in one kernel where no gradient is asked."""
+    given = (of_vertices, canonical.colors, canonical.shade, None if bend is None else bend.angles)
+    asked = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in given)
+    if asked or of_vertices.dtype != torch.float32:
+        return lit_in_steps(canonical, of_vertices, corners, bend, posed)
+    folds = creases = None
+    if bend is not None:
+        own, opened = bend.folds, opened_by_joints(bend.folds, bend.angles)
+        opened = opened.reshape(-1, *opened.shape[-2:])
+        folds = OpenFolds(own.row, opened, own.joints, own.between, own.painted, own.change)
+        flat = flat_share(bend.creases, posed)
+        creases = FlatCreases(bend.creases.row, flat.reshape(-1, flat.shape[-1]), bend.creases.change)
+    found = light_gaussians(
+        of_vertices.reshape(-1, *of_vertices.shape[-2:]), corners, canonical.colors, canonical.shade, (WEAK, DEEP),
+        folds, creases,
+    )  # fmt: skip
+    return found.view(*of_vertices.shape[:-2], *found.shape[1:])
 
 
 def in_even_light(canonical: CanonicalGaussians, light: HandLight) -> CanonicalGaussians:
@@ -136,9 +180,8 @@ def pose_gaussians(
     posed_vertices: Float[Tensor, "*B V 3"],
     light: SurfaceLight | None = None,
     center: Float[Tensor, "3"] | None = None,
-    opening: Opening | None = None,
+    bend: Bend | None = None,
     closeness: Float[Tensor, "*B V"] | None = None,
-    creases: Creases | None = None,
 ) -> Gaussians:
     """Gaussians that follow the surface from `rest_vertices` to `posed_vertices` (the paper's appendix B.1).
 
@@ -149,8 +192,8 @@ def pose_gaussians(
     its `rest_mesh`. If `posed_vertices` have a leading axis of poses, so have means, quats and scales. With a `light`,
     so have the colours: they are drawn in it, without the part that the posed surface hides. With the `center` of a
     camera, shade fades as that camera leaves the side of the photo; without, it is as the photo's camera saw it. With
-    an `opening`, folds over bent joints are open in that light. With the `closeness` of the `posed_vertices` to other
-    skin, little light comes between fingers that touch. With `creases`, those in stretched skin are flat.
+    a `bend`, folds over bent joints are open in that light, and creases in stretched skin flat. With the `closeness` of
+    the `posed_vertices` to other skin, little light comes between fingers that touch.
     """
     means, quats, scales, vertex_quats = pose_mesh_gaussians(
         rest_vertices, posed_vertices, faces, canonical.face_index, canonical.barycentrics, canonical.vertex_index,
@@ -163,8 +206,7 @@ def pose_gaussians(
         viewed = None
         if center is not None and light.photo_view is not None:
             viewed = view_share(light.photo_view, view_direction(posed_vertices, center))
-        factors = shading_factors(canonical, faces, light.light, on, light.seen, viewed, opening, light.corners)
-        if creases is not None:
-            factors = _times_exp(factors, creases.index, flat_creases(creases, posed_vertices))
-        colors = (colors * factors).clamp(0, 1)
+        of_vertices = vertex_light(light.light, on, light.seen, viewed)
+        corners = light.corners or gaussian_corners(faces, canonical)
+        colors = lit(canonical, of_vertices, corners, bend, posed_vertices)
     return Gaussians(means, quats, scales, canonical.opacities, colors)

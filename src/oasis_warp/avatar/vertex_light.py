@@ -180,7 +180,7 @@ def remaining_shade(light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | N
 
 def vertex_light(
     light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | None = None, viewed: Float[Tensor, "*B"] | None = None
-) -> Float[Tensor, "*B V C"]:
+) -> Float[Tensor, "*B V 5"]:
     """`vertex_light_in_steps`, in one kernel where no gradient is asked."""
     asked = torch.is_grad_enabled() and any(t.requires_grad for t in (on.normals, light.harmonics, light.limits))
     if asked or on.normals.dtype != torch.float32:
@@ -190,15 +190,15 @@ def vertex_light(
 
 def vertex_light_in_steps(
     light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | None = None, viewed: Float[Tensor, "*B"] | None = None
-) -> Float[Tensor, "*B V C"]:
-    """Factors of the sRGB colours of vertices; if there is any shade, then what stays of it.
+) -> Float[Tensor, "*B V 5"]:
+    """Factors of the sRGB colours of vertices, then the shares of deep and of weak shade that stay, 0 without any.
 
     `shading`, with the shade of the light, which is smooth or of pixels beside outlines; then `remaining_shade` times
     `viewed`.
     """
     of_vertices = shading(light, on)
     if light.facing is None:
-        return of_vertices
+        return torch.cat([of_vertices, torch.zeros_like(of_vertices[..., :2])], -1)
     stays = remaining_shade(light, on, seen)
     if viewed is not None:
         stays = stays * viewed[..., None, None]
@@ -209,7 +209,7 @@ def vertex_light_in_steps(
 
 def _vertex_light_at_once(
     light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | None, viewed: Float[Tensor, "*B"] | None
-) -> Float[Tensor, "*B V C"]:
+) -> Float[Tensor, "*B V 5"]:
     batch, mesh = on.normals.shape[:-2], sky.sky_mesh(on.normals.device)
     in_sky = on.exposure is not None and light.albedo is not None
 

@@ -71,8 +71,8 @@ def light_vertices(
     closeness: Float[Tensor, "B V"] | None = None,
     photo: InPhoto | None = None,
     viewed: Float[Tensor, "B"] | None = None,
-) -> Float[Tensor, "B V C"]:
-    """Factors of the vertices' sRGB colours; with a `photo`, then the shares of its deep and of its weak shade.
+) -> Float[Tensor, "B V 5"]:
+    """Factors of the vertices' sRGB colours, then the shares of deep and of weak shade, 0 without a `photo`.
 
     Args are those of `avatar.vertex_light`, float32; exposure comes with the albedo. Values and indices are
     trusted; not differentiable. The same in a batch as alone, to the bit on the CPU.
@@ -91,7 +91,7 @@ def light_vertices(
     params |= {
         "batch": batch, "n_vertices": n, "n_coarse": n_coarse, "n_nearby": n_nearby, "n_harmonics": len(harmonics),
         "rules": _rules(rules, normals.device), "agreement": normals.new_empty(batch, kernels.PARTS),
-        "opened": normals.new_empty(batch, n_coarse), "out": normals.new_empty(batch, n, 5 if photo else 3),
+        "opened": normals.new_empty(batch, n_coarse), "out": normals.new_empty(batch, n, 5),
     }  # fmt: skip
     if normals.is_cuda:
         stream = current_stream(normals.device)

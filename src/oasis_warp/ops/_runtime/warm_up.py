@@ -6,6 +6,7 @@ from oasis_warp.ops.blend_weights import blend_weights
 from oasis_warp.ops.contact import ContactTables, contact_shifts
 from oasis_warp.ops.corner_reading import Corners, read_corners
 from oasis_warp.ops.face_rotations import face_rotations
+from oasis_warp.ops.gaussian_light import light_gaussians
 from oasis_warp.ops.mesh_posing import pose_on_mesh
 from oasis_warp.ops.rasterization import rasterization
 from oasis_warp.ops.skinning import skin
@@ -38,7 +39,8 @@ def warm_up(device: torch.device | str = "cpu") -> None:
         coarse = Coarse(each, each[:, None], Corners(each[:, None].expand(4, 3), thirds))
         rules, photo = Rules(1.0, *[(1.0, 1.0, 1.0)] * 3, *map(float, range(10))), InPhoto(vertices, None, None, ones)
         read_corners(sky, coarse.corners)
-        light_vertices(vertices[None], scales, scales[:2], rules, coarse, sky, ones[:3], photo=photo)
+        columns = light_vertices(vertices[None], scales, scales[:2], rules, coarse, sky, ones[:3], photo=photo)
+        light_gaussians(columns, coarse.corners, thirds, thirds, (0.0, 1.0))
         whole = ContactTables(each, 4 * each[:2], 0 * each, none, none, none, ones, 4 * each, each, ones)
         contact_shifts(vertices[None], faces, whole, False)
         depth_visibility(vertices, vertices, faces, K, viewmat, 16, 16)
