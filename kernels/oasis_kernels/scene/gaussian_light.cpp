@@ -13,9 +13,9 @@ void light_gaussians(
 #undef INTEGERS
 #include "gaussian_light.h"
     const int blocks = (n + 15) / 16;
-    const long long all = (long long)batch * blocks, share = TASK / 16;
-    phase(state, (all + share - 1) / share, [&](long long task) {
-        for (long long block = task * share; block < wp::min(all, (task + 1) * share); block++) {
+    const long long all = (long long)batch * blocks, at_once = TASK / 16;
+    phase(state, (all + at_once - 1) / at_once, [&](long long task) {
+        for (long long block = task * at_once; block < wp::min(all, (task + 1) * at_once); block++) {
             const int b = block / blocks, i = 16 * (block - (long long)b * blocks), count = wp::min(16, n - i);
             const long long first = (long long)b * n_vertices;
             int around[48] = {};

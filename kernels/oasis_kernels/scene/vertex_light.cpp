@@ -50,9 +50,9 @@ void light_vertices(
     });
 
     const int blocks = (n_vertices + 15) / 16;
-    const long long all = (long long)batch * blocks, share = TASK / 16;
-    phase(state + 2 * PHASE_WORDS, (all + share - 1) / share, [&](long long task) {
-        for (long long block = task * share; block < wp::min(all, (task + 1) * share); block++) {
+    const long long all = (long long)batch * blocks, at_once = TASK / 16;
+    phase(state + 2 * PHASE_WORDS, (all + at_once - 1) / at_once, [&](long long task) {
+        for (long long block = task * at_once; block < wp::min(all, (task + 1) * at_once); block++) {
             const int b = block / blocks, i = 16 * (block - (long long)b * blocks), count = wp::min(16, n_vertices - i);
             const long long at = (long long)b * n_vertices + i;
             const V3 n = get3(normals + 3 * at, count);

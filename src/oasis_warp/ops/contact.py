@@ -8,17 +8,14 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from oasis_kernels.skinning import contact as kernels
-from oasis_kernels.skinning import contact_cuda
 from oasis_warp.ops._runtime.declaration import Array, Declaration
 from oasis_warp.ops._runtime.incidence import Incidence, incidence
 from oasis_warp.ops._runtime.launch import (
     aligned,
     block_count,
     current_stream,
-    even_cuts,
-    launch_ranges,
     run_cuda,
-    vectors,
+    run_native,
 )
 
 GROUP = 32
@@ -33,14 +30,10 @@ MARGIN = 0.00075
 """How far skin is moved out [m]: edges between vertices that just touch would still cross."""
 FADES = 0.5
 """Share of the skin around a vertex that touches, below which its shift fades: that at the edge of a contact."""
-ROUNDS = 6
-"""Rounds of contact resolution; later ones make up for what the mean took from the first."""
 BETWEEN = 0.0015
 """Distance along the skin to the nearest vertex that is no gap: that between vertices [m]."""
 PAD = 0.003
 """Margin around a part's box [m]: normals of the flesh below differ from the part's own and lead that far aside."""
-MIN_PARTS = 64
-"""Least parts for which another thread pays."""
 MAX_SURFACES = 1024
 """Surfaces of a launch on CUDA, at most: Warp counts threads in 32 bits."""
 
@@ -141,42 +134,20 @@ def _contact_on_cpu(
 ) -> Contact | None:  # fmt: skip
     batch, n, n_parts, n_groups = *vertices.shape[:2], *t.allowed.shape
 
-    empty = functools.partial(_empty, vertices)
-    points = vectors(vertices, 2)
-    corners, groups = vectors(empty(n_parts, 5, 3), 3), vectors(empty(n_groups, 2, 3), 3)
-    met, state = empty(n_parts, n_groups, dtype=torch.int32), empty(n_parts, dtype=torch.int32)
-    any_met = torch.zeros_like(state)
-    cuts = even_cuts(batch * n_parts, MIN_PARTS)
-    surface = [points, index.table, t.members, t.starts, t.samples, outward, DEEPEST, PAD, corners]
-    launch_ranges(kernels.boxes, cuts, surface, vertices)
-    launch_ranges(kernels.group_boxes, batch * n_groups, [corners, groups], vertices)
-    pairs = even_cuts(batch * n_parts * n_groups, MIN_PARTS * n_groups)
-    launch_ranges(kernels.meetings, pairs, [corners, groups, t.allowed, PARTS_OPPOSED, met, any_met], vertices)
-    if not any_met.any():
-        return None
-    launch_ranges(kernels.reached, cuts, [any_met, t.beside, state], vertices)
-    others, around, normals = empty(n, dtype=torch.int32), [t.offsets, t.neighbours], vectors(empty(n, 3), 2)
-    launch_ranges(kernels.normals, batch * n, [points, *index, t.part, state, outward, normals], vertices)
-    given = [points, normals, t.members, t.starts, t.part, corners, met, state, DEEPEST, OPPOSED, others]
-    launch_ranges(kernels.find, batch * n, given, vertices)
-    moving = torch.zeros_like(others)
-    launch_ranges(kernels.moving, batch * n, [others, *around, moving], vertices)
-    shifts, wanted = empty(n, 3).zero_(), empty(n, 4)
-    for k in range(ROUNDS):
-        before, after, leads = vectors(shifts, 2), empty(n, 3), vectors(wanted, 2)
-        given = [points, before, normals, others, *around, t.give, OPPOSED, ASIDE, MARGIN, leads]
-        launch_ranges(kernels.contacts, batch * n, given, vertices)
-        if k == 0 and not wanted[..., 3].any():
-            return None
-        given = [leads, before, moving, *around, t.weights, t.give, FADES, vectors(after, 2)]
-        launch_ranges(kernels.spread, batch * n, given, vertices)
-        shifts = after
-    if share is not None:
-        shifts = share[..., None] * shifts
-    close = torch.zeros_like(vertices[..., 0])
-    given = [points, vectors(shifts, 2), normals, others, *around, OPPOSED, BETWEEN, width, close]
-    launch_ranges(kernels.closeness, batch * n, given, vertices)
-    return Contact(shifts, close if share is None else share * close)
+    empty, whole = functools.partial(_empty, vertices), torch.int32
+    lengths = (DEEPEST, PAD, PARTS_OPPOSED, OPPOSED, ASIDE, MARGIN, FADES, BETWEEN, width)
+    state = torch.zeros(kernels.FLAGS + 2, dtype=torch.int64)
+    params = t._asdict() | {
+        "batch": batch, "n": n, "n_parts": n_parts, "n_groups": n_groups, "n_samples": t.samples.shape[1],
+        "n_beside": t.beside.shape[1], "mirrored": int(outward < 0), "lengths": torch.tensor(lengths),
+        "points": vertices, "faces": index.table, "face_offsets": index.offsets, "face_entries": index.entries,
+        "part_of_it": share, "tables": empty(4, n, 4), "sorted": empty(6, n + 16),
+        "boxes": empty(n_parts + n_groups, 16), "met": empty(n_parts, n_groups, dtype=whole),
+        "meets": empty(n_parts, dtype=whole), "others": empty(n, dtype=whole),
+        "moving": empty(n, dtype=whole).zero_(), "shifts": empty(n, 3), "close": empty(n), "state": state,
+    }  # fmt: skip
+    run_native(kernels.resolve, params, batch * n_parts)
+    return Contact(params["shifts"], params["close"]) if bool(state[kernels.FLAGS :].all()) else None
 
 
 def _contact_on_cuda(
@@ -186,8 +157,8 @@ def _contact_on_cuda(
     batch, n, n_parts, n_groups = *vertices.shape[:2], *t.allowed.shape
 
     empty = functools.partial(_empty, vertices)
-    box_blocks, find_blocks = (block_count(batch * items, contact_cuda.WARPS) for items in (n_parts, n))
-    rows = block_count(batch * n, contact_cuda.BLOCK // contact_cuda.LANES)
+    box_blocks, find_blocks = (block_count(batch * items, kernels.WARPS) for items in (n_parts, n))
+    rows = block_count(batch * n, kernels.BLOCK // kernels.LANES)
     params = t._asdict() | {
         "batch": batch, "n": n, "n_parts": n_parts, "n_groups": n_groups, "reach": DEEPEST, "points": vertices,
         "boxes": empty(5, n_parts, 4), "normals": empty(n, 3), "met": empty(n_parts, n_groups, dtype=torch.int32),
@@ -200,19 +171,19 @@ def _contact_on_cuda(
         "box_blocks": box_blocks, "offsets": index.offsets, "entries": index.entries, "faces": index.table,
         "n_samples": t.samples.shape[1], "outward": outward, "pad": PAD,
     }  # fmt: skip
-    vertex_blocks = block_count(batch * n, contact_cuda.BLOCK)
-    run_cuda(contact_cuda.boxes, params | surface, box_blocks + vertex_blocks, stream)
+    vertex_blocks = block_count(batch * n, kernels.BLOCK)
+    run_cuda(kernels.boxes, params | surface, box_blocks + vertex_blocks, stream)
     near = {"n_beside": t.beside.shape[1], "opposed": PARTS_OPPOSED}
-    run_cuda(contact_cuda.meetings, params | near, box_blocks, stream)
+    run_cuda(kernels.meetings, params | near, box_blocks, stream)
     params["opposed"] = OPPOSED
-    run_cuda(contact_cuda.find, params, find_blocks, stream)
-    for k in range(ROUNDS):
-        run_cuda(contact_cuda.contacts, params, rows, stream)
-        if changes is not None and k == ROUNDS - 1:
+    run_cuda(kernels.find, params, find_blocks, stream)
+    for k in range(kernels.ROUNDS):
+        run_cuda(kernels.contacts, params, rows, stream)
+        if changes is not None and k == kernels.ROUNDS - 1:
             params |= {"changes": changes, "n_changes": changes.shape[1]}
         params["out"] = empty(n, 3)
-        run_cuda(contact_cuda.spread, params, rows, stream)
+        run_cuda(kernels.spread, params, rows, stream)
         params["shifts"] = params["out"]
     params["close"] = empty(n)
-    run_cuda(contact_cuda.closeness, params | {"aside": BETWEEN, "width": width}, rows, stream)
+    run_cuda(kernels.closeness, params | {"aside": BETWEEN, "width": width}, rows, stream)
     return Contact(params["shifts"], params["close"])
