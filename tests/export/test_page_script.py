@@ -48,7 +48,7 @@ NODE = shutil.which("node")
         ("contact.js", "OPPOSED", contact.OPPOSED),
         ("contact.js", "PARTS_OPPOSED", contact.PARTS_OPPOSED),
         ("contact.js", "FADES", contact.FADES),
-        ("contact.js", "ROUNDS", contact.ROUNDS),
+        ("contact.js", "ROUNDS", contact.kernels.ROUNDS),
         ("posing.js", "FLAT", posing.FLAT),
         ("posing.js", "DAMPING", posing.DAMPING),
         ("posing.js", "MAX_GROWTH", posing.LIMIT),

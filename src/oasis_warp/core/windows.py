@@ -1,25 +1,30 @@
-"""Means and maxima over squares of pixels, along rows, then columns: the cost grows with a side, not with the area."""
+"""Means and maxima over squares of pixels, along rows, then columns, in times that hardly grow with the square."""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d
+from torch.nn.functional import pad
 
 
 def mean_around(planes: Float[Tensor, "*B H W"], pixels: int) -> Float[Tensor, "*B H W"]:
     """The mean over the pixels up to `pixels` away along both axes. Pixels beyond the picture count as 0."""
-    rows = planes.reshape(-1, 1, *planes.shape[-2:])
+    side = 2 * pixels + 1
     for _ in range(2):  # along rows, where memory is contiguous, then turned
-        rows = avg_pool2d(rows, (1, 2 * pixels + 1), stride=1, padding=(0, pixels)).mT.contiguous()
-    return rows.view(planes.shape)
+        sums = pad(planes, (pixels + 1, pixels)).cumsum(-1, dtype=torch.float64)
+        planes = ((sums[..., side:] - sums[..., :-side]) / side).to(planes.dtype).mT.contiguous()
+    return planes
 
 
 def largest_around(planes: Float[Tensor, "*B H W"], pixels: int) -> Float[Tensor, "*B H W"]:
     """The largest value up to `pixels` away along both axes."""
-    rows = planes.reshape(-1, 1, *planes.shape[-2:])
+    side = 2 * pixels + 1
     for _ in range(2):
-        rows = max_pool2d(rows, (1, 2 * pixels + 1), stride=1, padding=(0, pixels)).mT.contiguous()
-    return rows.view(planes.shape)
+        planes, width = pad(planes, (pixels, pixels), value=-torch.inf), 1
+        while 2 * width <= side:  # the largest of so many from each pixel on
+            planes, width = torch.maximum(planes[..., :-width], planes[..., width:]), 2 * width
+        rest = side - width
+        planes = torch.maximum(planes[..., : planes.shape[-1] - rest], planes[..., rest:]).mT.contiguous()
+    return planes
 
 
 def smooth_mean_around(
