@@ -29,10 +29,9 @@ def scene(hand, device):
     seen = (exposure[1, :, 0] - 0.2 * torch.rand(n, generator=random)).clamp_min(0)
     seen[::2] = 1
     viewed = torch.tensor([1.0, 0.6, 0.0])
-    return tuple(
-        value.to(device) if isinstance(value, torch.Tensor) else type(value)(*(part.to(device) for part in value))
-        for value in (light, on, seen, viewed)
-    )
+    there = HandLight(*(None if part is None else part.to(device) for part in light))
+    on = Lighting(*(None if part is None else part.to(device) for part in on))
+    return there, on, seen.to(device), viewed.to(device)
 
 
 def test_one_kernel_gives_what_many_steps_give_with_any_part_left_out(scene):

@@ -182,8 +182,9 @@ def vertex_light(
     light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | None = None, viewed: Float[Tensor, "*B"] | None = None
 ) -> Float[Tensor, "*B V 5"]:
     """`vertex_light_in_steps`, in one kernel where no gradient is asked."""
-    asked = torch.is_grad_enabled() and any(t.requires_grad for t in (on.normals, light.harmonics, light.limits))
-    if asked or on.normals.dtype != torch.float32:
+    given = on.normals, light.harmonics, light.limits
+    asked = torch.is_grad_enabled() and any(t.requires_grad for t in given)
+    if asked or any(t.dtype != torch.float32 for t in given):
         return vertex_light_in_steps(light, on, seen, viewed)
     return _vertex_light_at_once(light, on, seen, viewed)
 

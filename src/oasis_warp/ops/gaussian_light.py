@@ -70,21 +70,21 @@ def light_gaussians(
     row, opened, joints, between, painted, fold_change = contiguous(*(folds or [None] * 6))
     crease, flat, crease_change = contiguous(*(creases or [None] * 3))
     index, weights, columns, colors, shade = contiguous(*corners, columns, colors, shade)
+    out = colors.new_empty(batch, n, 3)
     params = {
         "batch": batch, "n_vertices": columns.shape[1], "n": n, "n_joints": 0 if opened is None else opened.shape[1],
         "bounds": _bounds(bounds, colors.device), "columns": columns, "corners": index, "weights": weights,
         "colors": colors, "shade": shade, "folds": row, "opened": opened, "joints": joints, "between": between,
         "painted": painted, "fold_change": fold_change, "creases": crease, "flat": flat,
-        "crease_change": crease_change, "out": colors.new_empty(batch, n, 3),
+        "crease_change": crease_change, "out": out,
     }  # fmt: skip
     if colors.is_cuda:
         run_cuda(
             kernels.light_gaussians_cuda, params, block_count(batch * n, kernels.BLOCK), current_stream(colors.device)
         )
     else:
-        params["state"] = phase_state(kernels.STATE)
-        run_native(kernels.light_gaussians, params, task_count(batch * n))
-    return params["out"]
+        run_native(kernels.light_gaussians, params | {"state": phase_state(kernels.STATE)}, task_count(batch * n))
+    return out
 
 
 @functools.cache

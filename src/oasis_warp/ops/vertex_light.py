@@ -78,20 +78,18 @@ def light_vertices(
     trusted; not differentiable. The same in a batch as alone, to the bit on the CPU.
     """
     batch, n = normals.shape[:2]
-    params = dict(
-        zip(
-            ("normals", "harmonics", "limits", "exposure", "albedo", "closeness", "viewed", "in_photo", "shade",
-             "doubt", "seen", "corners", "weights", "coarse", "nearby"),
-            contiguous(normals, harmonics, limits, exposure, albedo, closeness, viewed, *(photo or [None] * 4),
-                       *coarse.corners, coarse.vertices, coarse.nearby),
-            strict=True,
-        )
-    )  # fmt: skip
     n_coarse, n_nearby = coarse.nearby.shape
-    params |= {
+    normals, harmonics, limits, exposure, albedo = contiguous(normals, harmonics, limits, exposure, albedo)
+    closeness, viewed, facing, shade, doubt, seen = contiguous(closeness, viewed, *(photo or [None] * 4))
+    vertices, nearby, corners, weights = contiguous(coarse.vertices, coarse.nearby, *coarse.corners)
+    out = normals.new_empty(batch, n, 5)
+    params = {
         "batch": batch, "n_vertices": n, "n_coarse": n_coarse, "n_nearby": n_nearby, "n_harmonics": len(harmonics),
-        "rules": _rules(rules, normals.device), "agreement": normals.new_empty(batch, kernels.PARTS),
-        "opened": normals.new_empty(batch, n_coarse), "out": normals.new_empty(batch, n, 5),
+        "rules": _rules(rules, normals.device), "normals": normals, "harmonics": harmonics, "limits": limits,
+        "exposure": exposure, "albedo": albedo, "closeness": closeness, "in_photo": facing, "seen": seen,
+        "doubt": doubt, "viewed": viewed, "shade": shade, "coarse": vertices, "nearby": nearby, "corners": corners,
+        "weights": weights, "agreement": normals.new_empty(batch, kernels.PARTS),
+        "opened": normals.new_empty(batch, n_coarse), "out": out,
     }  # fmt: skip
     if normals.is_cuda:
         stream = current_stream(normals.device)
@@ -100,9 +98,8 @@ def light_vertices(
             run_cuda(kernels.prepare, params, blocks if n else 0, stream)
         run_cuda(kernels.light_vertices_cuda, params, block_count(batch * n, kernels.BLOCK), stream)
     else:
-        params["state"] = phase_state(kernels.STATE)
-        run_native(kernels.light_vertices, params, task_count(batch * n))
-    return params["out"]
+        run_native(kernels.light_vertices, params | {"state": phase_state(kernels.STATE)}, task_count(batch * n))
+    return out
 
 
 @functools.cache
