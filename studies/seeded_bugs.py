@@ -43,6 +43,11 @@ def _of(room: str, tests: str, only: str, name: str, old: str, new: str) -> Bug:
     return Bug(f"{room}: {name}", f"src/oasis_warp/{room}.py", old, new, (f"tests/{tests}.py", "-k", only))
 
 
+def _at(module: str, tests: str, only: str, name: str, old: str, new: str) -> Bug:
+    """The same in a file of kernels."""
+    return Bug(f"{module}: {name}", f"{KERNELS}/{module}", old, new, (f"tests/{tests}.py", "-k", only))
+
+
 PIPELINE = [
     _of("avatar/observation", "avatar/test_quality", "projects_to", "the photo read half a pixel off",
         "(2 * uv - 1)[:, None], align_corners=False", "(2 * uv - 1)[:, None], align_corners=True"),
@@ -93,7 +98,7 @@ PIPELINE = [
     _of("adaptation/sh_lighting", "adaptation/test_sh_lighting", "single_gaussians", "marks judged per Gaussian",
         "albedo = read[:, 4:] * torch.lerp(beyond, skin, read[:, 3:4])",
         "albedo = torch.lerp(beyond, skin, 1 - mark_probability(beyond))"),
-    _of("avatar/vertex_light", "avatar/test_sky", "what_cast_it", "a shadow outlives what cast it",
+    _of("avatar/vertex_light", "avatar/test_sky", "deep_shade_beside", "a shadow outlives what cast it",
         "change = (on.exposure[..., 0] - seen).clamp_min(0)", "change = 0 * on.exposure[..., 0]"),
     _of("avatar/folds", "avatar/test_folds", "straight_ones", "seen and painted folds swapped",
         "seen, painted = of_photo * (1 - folds.painted), of_straight * folds.painted",
@@ -151,12 +156,25 @@ PIPELINE = [
     _of("ops/_runtime/blend_tiles", "certify/test_grid", "small_scenes and rasterization", "farthest first",
         "torch.argsort(depths.view(-1)[drawn], stable=True)", "torch.argsort(-depths.view(-1)[drawn], stable=True)"),
 ]  # fmt: skip
+SCENE = [
+    _at("scene/vertex_light.h", "ops/test_vertex_light", "many_steps", "weak shade stays beside moved fingers",
+        "ramp(own + (near - own) * doubtful, other, same)", "ramp(own, other, same)"),
+    _at("scene/gaussian_light.h", "ops/test_gaussian_light", "many_steps", "painted folds open as the photo's do",
+        "(first[1] + (second[1] - first[1]) * t) * paint", "(first[0] + (second[0] - first[0]) * t) * paint"),
+    _at("scene/sky_light.h", "ops/test_spherical_harmonics", "draw_both", "radiance as blurred as irradiance",
+        "h[0] + 1.5f * (h[3]", "h[0] + 1.0f * (h[3]"),
+    _at("skinning/contact.cpp", "hand/test_contact", "farther_than_the_limit", "flesh gives way without limit",
+        "if (length > give[v]) moved *= give[v] / length;", ""),
+    _at("skinning/contact.cpp", "hand/test_contact", "skin_that_faces", "gaps to skin that faces away",
+        "(cosine < opposed)", "(cosine > opposed)"),
+]  # fmt: skip
 STOPS = f"\n{28 * ' '}transmittance[pixel] = -before\n{28 * ' '}stops[pixel] = place"
 PIXEL = f"\n{20 * ' '}pixel = (camera * height + y) * width + x"
 """Lines of `blend` that tell it from `weigh` in the same file."""
 
 BUGS = [
     *PIPELINE,
+    *SCENE,
     *_in(
         "rasterize/rasterize_forward.py", "rasterization",
         ("pixel centre without 0.5", "type(whole)(0.5) - remainder", "type(whole)(0.0) - remainder"),
