@@ -159,6 +159,8 @@ PIPELINE = [
 SCENE = [
     _at("scene/vertex_light.h", "ops/test_vertex_light", "many_steps", "weak shade stays beside moved fingers",
         "ramp(own + (near - own) * doubtful, other, same)", "ramp(own, other, same)"),
+    _at("scene/vertex_light.h", "avatar/test_sky", "finger_that_opens", "a shadow outlives what cast it",
+        "    *deep = *deep * ramp(near, other, same);\n", ""),
     _at("scene/gaussian_light.h", "ops/test_gaussian_light", "many_steps", "painted folds open as the photo's do",
         "(first[1] + (second[1] - first[1]) * t) * paint", "(first[0] + (second[0] - first[0]) * t) * paint"),
     _at("scene/sky_light.h", "ops/test_spherical_harmonics", "draw_both", "radiance as blurred as irradiance",

@@ -89,6 +89,26 @@ def test_shade_goes_when_what_cast_it_has_moved(hand, scene):
     assert float(ratios[1]) > 0.95
 
 
+def test_deep_shade_ends_under_a_finger_that_opens_and_stays_under_the_others(hand, scene):
+    """In the kernel that poses take: one finger leaves the hand's pose nearly as it was, so the sky alone decides."""
+    crop, truth, pose = scene
+    on = posed_lighting(crop.rest.vertices, crop.posed.vertices, hand.faces, EVEN)
+    shaded = EVEN._replace(shade=torch.full_like(on.normals, 0.4), facing=on.normals)
+    plain, dark = (avatar_of(hand, truth, pose, crop.camera, light) for light in (EVEN, shaded))
+    finger = [hand.joint_names.index(f"index{k}") - 1 for k in (1, 2, 3)]
+    angles = pose.angles.clone()
+    angles[finger] = named_pose(hand, "open")[finger]
+    moved = pose._replace(angles=angles)
+    surface = dark.mesh(moved).vertices
+    facing = posed_lighting(crop.rest.vertices, surface, hand.faces, EVEN).normals
+    more = (seen(hand, crop, surface) - seen(hand, crop, crop.posed.vertices))[truth.vertex_index]
+    still = ((facing * on.normals).sum(1) > 0.999)[truth.vertex_index]
+    left = (dark.pose(moved).colors / plain.pose(moved).colors)[: len(still), 1]
+    assert int((still & (more > 0.26)).sum()) > 10
+    assert float(left[still & (more > 0.26)].median()) > 0.95
+    assert float(left[still & (more.abs() < 0.01)].median()) < 0.5
+
+
 def test_deep_shade_beside_a_finger_that_lay_there_goes_with_it_and_weak_shade_stays(hand, scene):
     """Palms opened from a fist kept the gaps between its fingers, a pixel off, where the skin sees as much sky."""
     crop, truth, _ = scene
