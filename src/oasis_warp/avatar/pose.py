@@ -13,6 +13,7 @@ from oasis_warp.avatar.vertex_light import (
     GAMMA,
     Lighting,
     SurfaceLight,
+    kernels_take,
     lighting,
     vertex_light,
     view_direction,
@@ -108,10 +109,8 @@ def lit(
     posed: Float[Tensor, "*B V 3"],
 ) -> Float[Tensor, "*B N 3"]:  # fmt: skip
     """`lit_in_steps`, in one kernel where no gradient is asked."""
-    every = of_vertices, canonical.colors, canonical.shade, None if bend is None else bend.angles
-    given = [t for t in every if t is not None]
-    asked = torch.is_grad_enabled() and any(t.requires_grad for t in given)
-    if asked or any(t.dtype != torch.float32 for t in given):
+    angles = None if bend is None else bend.angles
+    if not kernels_take(of_vertices, canonical.colors, canonical.shade, angles):
         return lit_in_steps(canonical, of_vertices, corners, bend, posed)
     folds = creases = None
     if bend is not None:

@@ -182,11 +182,16 @@ def vertex_light(
     light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | None = None, viewed: Float[Tensor, "*B"] | None = None
 ) -> Float[Tensor, "*B V 5"]:
     """`vertex_light_in_steps`, in one kernel where no gradient is asked."""
-    given = on.normals, light.harmonics, light.limits
-    asked = torch.is_grad_enabled() and any(t.requires_grad for t in given)
-    if asked or any(t.dtype != torch.float32 for t in given):
-        return vertex_light_in_steps(light, on, seen, viewed)
-    return _vertex_light_at_once(light, on, seen, viewed)
+    if kernels_take(on.normals, light.harmonics, light.limits):
+        return _vertex_light_at_once(light, on, seen, viewed)
+    return vertex_light_in_steps(light, on, seen, viewed)
+
+
+def kernels_take(*tensors: Tensor | None) -> bool:
+    """Whether the kernels of light take these: they are float32, and have no gradients."""
+    given = [tensor for tensor in tensors if tensor is not None]
+    asked = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in given)
+    return not asked and all(tensor.dtype == torch.float32 for tensor in given)
 
 
 def vertex_light_in_steps(
