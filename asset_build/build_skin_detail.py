@@ -18,7 +18,7 @@ import torch
 from scipy.sparse.linalg import splu
 
 from oasis_warp.adaptation.inpainting import laplacian_and_mass
-from oasis_warp.adaptation.skin_detail import FINER, FORM_UNIT
+from oasis_warp.adaptation.skin_detail import FINER, FORM_UNIT, LOUDEST_LINE, NO_LINE
 from oasis_warp.avatar.appearance import label_regions
 from oasis_warp.avatar.wrist import shade_left
 from oasis_warp.core.hand_model import HandModel
@@ -73,15 +73,18 @@ RIM = 3.0
 """Width of the islands' rims over which detail fades in: what lies beside them bled into them [texels]."""
 GREY, STEPS = 128, 400
 """Value of the maps that stands for none, and steps to one of the natural logarithm."""
-PEOPLE, LOUDEST_LINE = (19, 43), 2.0
-"""People of the synthetic world whose palm's lines are taken, and the first one's veins; the strength of a line that is
-stored as 255. The photos' own lines are blurred. Chosen by eye among 46 people, for long and soft lines."""
-FOLDS, FOLDS_OF_THUMB = {1: (6, 6.5, 1.6), 2: (3, 2.2, 1.3)}, {2: (5, 4.5, 0.9)}
+PEOPLE = (19, 43)
+"""People of the synthetic world whose palm's lines are taken, and the first one's veins. The photos' own lines are
+blurred. Chosen by eye among 46 people, for long and soft lines."""
+FOLDS, FOLDS_OF_THUMB = {1: (6, 6.4, 1.5), 2: (3, 2.3, 1.1)}, {2: (5, 4.5, 0.7)}
 """Number of folds over a finger's middle and end joint, how far from it they lie [mm], and their greatest strength. The
 thumb's middle joint has none: they looked like a scab there."""
-FOLD_ANGLE, FOLD_BOW = 0.95, -1.6
+FOLD_ANGLE, FOLD_BOW = 1.4, -1.6
 """Half of what the longest fold covers around the finger [rad], and how far the ends of the outermost ones bend back
-towards the joint [mm/rad^2]."""
+towards the joint [mm/rad^2]. With .95 folds were short strokes, like scratches."""
+RIDGE = 8.0
+"""Blur of the folds that is taken off [finer texels of .3 mm]: skin between folds is a ridge, which catches light, so
+that a joint is no brown patch."""
 PALM_LINES = {"crease": 1.4, "main": 1.35, "minor": 0.7, "wrinkle": 0.5, "halo": 0.3}
 """How dark lines of the palm are, in units of a clear fold: as the synthetic world draws them, halved by sRGB. More and
 darker fine lines looked like a hairy rash to strangers."""
@@ -120,7 +123,7 @@ def main(folder: Path) -> None:
         write(target / f"detail_{k}.png", spread_out(stored, faces >= 0))
     faces, places = rasterize(FINER * texel_corners(hand), FINER * BOX[3], FINER * BOX[2])
     write(target / "nails.png", spread_out(nails(hand, faces, places), faces >= 0))
-    write(target / "lines.png", spread_out(lines(hand, faces, places), faces >= 0, fill=0))
+    write(target / "lines.png", spread_out(lines(hand, faces, places), faces >= 0, fill=NO_LINE))
     write_relief(hand, target / "relief.npz")
     maps = sorted([*target.glob("*.png"), *target.glob("*.npz")])
     sums = [f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.name}" for path in maps]
@@ -129,12 +132,14 @@ def main(folder: Path) -> None:
 
 def lines(hand: HandModel, faces: np.ndarray, places: np.ndarray) -> np.ndarray:
     """The drawn lines of two persons and one person's veins, [H, W, 3]."""
-    drawn = [knuckle_folds(number) + lines_on_palm(hand, number) for number in PEOPLE]
-    read = 255 * resampled(torch.stack([*drawn, veins(hand)], 1) / LOUDEST_LINE, faces, places)
+    folds = resampled(torch.stack([knuckle_folds(number) for number in PEOPLE], 1), faces, places)
+    others = [*(lines_on_palm(hand, number) for number in PEOPLE), veins(hand)]
+    read = resampled(torch.stack(others, 1), faces, places)
+    read[..., : len(PEOPLE)] += folds - mean_around(folds, faces >= 0, RIDGE)
     read *= 1 - (1 - LINES_ON_PADS) * finger_pads(hand, faces, places, FINER)[..., None]
     before_wrist = shade_left(hand, hand.template)[:, 0]  # Gaussians stay coarse there, and thin lines would be dots
     read *= on_texels(before_wrist, hand, faces, places)[..., None]
-    return np.rint(np.clip(read, 0, 255)).astype(np.uint8)
+    return np.rint(np.clip(NO_LINE + (255 - NO_LINE) / LOUDEST_LINE * read, 0, 255)).astype(np.uint8)
 
 
 def write_relief(hand: HandModel, path: Path) -> None:
@@ -202,11 +207,16 @@ def band_pass(hand: HandModel, texture: np.ndarray, faces: np.ndarray, places: n
 
 def sharpened(detail: np.ndarray, on: np.ndarray) -> np.ndarray:
     """The detail with more of what is fine, in the colour of shade."""
-    weight = cv2.GaussianBlur(on.astype(np.float64), (0, 0), FINE)
-    coarse = cv2.GaussianBlur(detail * on[..., None], (0, 0), FINE) / np.maximum(weight, 1e-6)[..., None]
+    coarse = mean_around(detail, on, FINE)
     fine = np.where(on[..., None], detail - coarse, 0)
     grey = fine.mean(2, keepdims=True)
     return np.where(on[..., None], coarse, 0) + FINE_GAIN * (grey * np.array(DARKER) + COLOUR * (fine - grey))
+
+
+def mean_around(values: np.ndarray, on: np.ndarray, reach: float) -> np.ndarray:
+    """Values blurred by a Gaussian of that standard deviation [texels], without those beside the hand, [H, W, C]."""
+    weight = cv2.GaussianBlur(on.astype(np.float64), (0, 0), reach)
+    return cv2.GaussianBlur(values * on[..., None], (0, 0), reach) / np.maximum(weight, 1e-6)[..., None]
 
 
 def even_palm(hand: HandModel, detail: np.ndarray, faces: np.ndarray, places: np.ndarray) -> np.ndarray:
@@ -219,17 +229,13 @@ def even_palm(hand: HandModel, detail: np.ndarray, faces: np.ndarray, places: np
     on = faces >= 0
     palm, pads = on_texels(label_regions(hand).palm, hand, faces, places), finger_pads(hand, faces, places)
 
-    def around(values: np.ndarray, reach: float) -> np.ndarray:
-        weight = cv2.GaussianBlur(on.astype(np.float64), (0, 0), reach)
-        return cv2.GaussianBlur(values * on[..., None], (0, 0), reach) / np.maximum(weight, 1e-6)[..., None]
-
-    fine = around(detail - around(detail, WIDEST_ON_PALM), SOFT)
+    fine = mean_around(detail - mean_around(detail, on, WIDEST_ON_PALM), on, SOFT)
     for _ in range(EVENINGS):
-        contrast = np.sqrt(around(np.square(fine), EVEN_REACH).mean(2, keepdims=True))
+        contrast = np.sqrt(mean_around(np.square(fine), on, EVEN_REACH).mean(2, keepdims=True))
         fine = PALM_CONTRAST * fine / np.hypot(contrast, FLAT)
         fine = PALM_LOUDEST * np.tanh(fine / PALM_LOUDEST)
     fine *= 1 - (1 - ON_PADS) * pads[..., None]
-    detail = detail - LESS_ON_BACK * around(detail, WIDE_ON_BACK)
+    detail = detail - LESS_ON_BACK * mean_around(detail, on, WIDE_ON_BACK)
     return np.where(on[..., None], detail + palm[..., None] * (fine - detail), 0)
 
 

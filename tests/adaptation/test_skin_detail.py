@@ -66,6 +66,22 @@ def test_palm_lines_are_one_persons_and_take_turns_with_the_seed(hand):
     assert not torch.equal(*dark)
 
 
+def test_folds_of_straight_fingers_are_no_darker_than_the_skin_around(hand):
+    """Folds without ridges between them made a brown patch of a joint, and short ones were scratches."""
+    faces = torch.arange(len(hand.faces))
+    middle = torch.full((len(faces), 3), 1 / 3)
+    fold = sample_detail(hand, at_places(faces[:0], faces, middle), 0).fold
+    segment = hand.segment[hand.faces[:, 0]]
+    palm, along, around = (
+        values[hand.faces].mean(1) for values in (skin_regions(hand).palm, hand.bone_t, hand.bone_theta.cos())
+    )
+    for bone in (2, 5, 8, 11):  # the second of each finger
+        joint = (segment == bone) & (palm < 0.05) & (along < 0.25) & (around > 0.3)
+        assert abs(float(fold[joint].mean())) < 0.04
+        assert float(fold[joint].amin()) < -0.15
+        assert float(fold[joint & (around < 0.7)].std()) > 0.02
+
+
 def test_the_same_place_has_the_same_detail_as_a_vertex_and_on_a_face(hand):
     """A wrong corner of the texture coordinates would show another place's skin; islands' rims have two."""
     index = torch.arange(len(hand.template))

@@ -26,8 +26,8 @@ GREY, UNIT = 128, 400
 SOFT = 0.45
 """Standard deviation of the blur of the detail maps [texels]: without, backs of fine Gaussians have 1.4 times real
 hands' contrast below 1 px."""
-LOUDEST_LINE = 2.0
-"""Strength of a line that is stored as 255."""
+NO_LINE, LOUDEST_LINE = 64, 2.0
+"""Value of the maps of lines that stands for none, and strength of a line that is stored as 255."""
 FINER = 3
 """Texels of the drawn lines in one of the other maps along each side: those are .45 mm wide on palms and 1 mm on
 fingers, whose folds they blur into a stain."""
@@ -48,7 +48,8 @@ class SkinDetail(NamedTuple):
     skin: Float[Tensor, "N 3"]
     """Added to the logarithm of sRGB; 0 on nails."""
     fold: Float[Tensor, "N"]
-    """Depth of the folds over the joints and of the palm's lines, 1 for a clear fold."""
+    """Depth of the folds over the joints and of the palm's lines, 1 for a clear fold; the ridges between folds, whose
+    skin is brighter, are below 0."""
     vein: Float[Tensor, "N"]
     """Strength of the veins on the back."""
     plate: Float[Tensor, "N"]
@@ -133,7 +134,7 @@ def _maps() -> tuple[Float[Tensor, "C H W"], Float[Tensor, "6 h w"]]:
         return bgr[..., ::-1].astype(np.float32)
 
     detail = [cv2.GaussianBlur((read(f"detail_{k}.png") - GREY) / UNIT, (0, 0), SOFT) for k in range(HANDS)]
-    lines = read("lines.png") * (LOUDEST_LINE / 255)
+    lines = (read("lines.png") - NO_LINE) * (LOUDEST_LINE / (255 - NO_LINE))
     nails = (read("nails.png") - np.float32([0, GREY, 0])) / np.float32([255, 127, 255])
     channels = np.concatenate(detail, 2), np.concatenate([lines, nails], 2)
     maps, fine = (torch.from_numpy(values).permute(2, 0, 1).contiguous() for values in channels)
