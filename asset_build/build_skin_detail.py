@@ -82,12 +82,12 @@ thumb's middle joint has none: they looked like a scab there."""
 FOLD_ANGLE, FOLD_BOW = 1.4, -1.6
 """Half of what the longest fold covers around the finger [rad], and how far the ends of the outermost ones bend back
 towards the joint [mm/rad^2]. With .95 folds were short strokes, like scratches."""
-RIDGE = 8.0
-"""Blur of the folds that is taken off [finer texels of .3 mm]: skin between folds is a ridge, which catches light, so
-that a joint is no brown patch."""
-PALM_LINES = {"crease": 1.4, "main": 1.35, "minor": 0.7, "wrinkle": 0.5, "halo": 0.3}
-"""How dark lines of the palm are, in units of a clear fold: as the synthetic world draws them, halved by sRGB. More and
-darker fine lines looked like a hairy rash to strangers."""
+PALM_LINES = {"crease": 2.2, "main": 1.8, "minor": 0.6, "wrinkle": 0.5}
+"""How dark lines of the palm are, in units of a clear fold. More and darker fine lines looked like a hairy rash to
+strangers."""
+RIDGE, PALM_RIDGE = 8.0, 5.0
+"""Blurs of folds and of the palm's lines that are taken off [finer texels of .3 mm]: skin beside them is a ridge, which
+catches light. Without, a joint was a brown patch, and creases were painted bands."""
 PAD_RIM = 3.0
 """Blur of the border between fingers and palm [texels]."""
 LINES_ON_PADS = 0.9
@@ -132,10 +132,10 @@ def main(folder: Path) -> None:
 
 def lines(hand: HandModel, faces: np.ndarray, places: np.ndarray) -> np.ndarray:
     """The drawn lines of two persons and one person's veins, [H, W, 3]."""
-    folds = resampled(torch.stack([knuckle_folds(number) for number in PEOPLE], 1), faces, places)
-    others = [*(lines_on_palm(hand, number) for number in PEOPLE), veins(hand)]
-    read = resampled(torch.stack(others, 1), faces, places)
-    read[..., : len(PEOPLE)] += folds - mean_around(folds, faces >= 0, RIDGE)
+    drawn = [[draw(number) for number in PEOPLE] for draw in (knuckle_folds, lines_on_palm)]
+    folds, palms = (resampled(torch.stack(people, 1), faces, places) for people in drawn)
+    folds += palms - mean_around(folds, faces >= 0, RIDGE) - mean_around(palms, faces >= 0, PALM_RIDGE)
+    read = np.concatenate([folds, resampled(veins()[:, None], faces, places)], 2)
     read *= 1 - (1 - LINES_ON_PADS) * finger_pads(hand, faces, places, FINER)[..., None]
     before_wrist = shade_left(hand, hand.template)[:, 0]  # Gaussians stay coarse there, and thin lines would be dots
     read *= on_texels(before_wrist, hand, faces, places)[..., None]
@@ -265,9 +265,9 @@ def light_around_bones(hand: HandModel, colors: np.ndarray) -> np.ndarray:
     return splu((sparse.diags_array(mass) + SMOOTH**2 * laplacian).tocsc()).solve(mass[:, None] * fitted)
 
 
-def veins(hand: HandModel) -> torch.Tensor:
+def veins() -> torch.Tensor:
     """The veins of one person of the synthetic world, at its texels; none on the palm."""
-    person = sample_identity(hand, 0, PEOPLE[0], Population(hair=0))
+    person = sample_identity(bundled_hand(), 0, PEOPLE[0], Population(hair=0))
     return draw_lines(plan_skin(person).lines, texels_on("cpu").grid)["vein"] * (1 - palm_share())
 
 
@@ -291,9 +291,9 @@ def knuckle_folds(seed: int) -> torch.Tensor:
     return draw_lines(strokes.lines(), texels_on("cpu").grid)["fold"] * (1 - palm_share())
 
 
-def lines_on_palm(hand: HandModel, number: int) -> torch.Tensor:
+def lines_on_palm(number: int) -> torch.Tensor:
     """How dark the lines of one person's palm are, at its texels; 0 on the back."""
-    person = sample_identity(hand, 0, number, Population(hair=0))
+    person = sample_identity(bundled_hand(), 0, number, Population(hair=0))
     lines = draw_lines(plan_skin(person).lines, texels_on("cpu").grid)
     return palm_share() * sum(gain * lines[name] for name, gain in PALM_LINES.items())
 

@@ -8,6 +8,7 @@ from oasis_warp.adaptation.skin_grain import CELL, skin_grain
 from oasis_warp.adaptation.unseen_skin import _skin_detail
 from oasis_warp.avatar.appearance import label_regions, skin_regions
 from oasis_warp.core import surface
+from oasis_warp.core.hand_model import finger_of
 from oasis_warp.core.types import CanonicalGaussians
 from oasis_warp.hand.template import bundled_hand
 
@@ -47,6 +48,16 @@ def test_blotches_of_blood_are_a_seeds_own_and_strongest_on_the_palm():
     assert float(first.mean().abs()) < 0.005
 
 
+def test_no_finger_is_redder_than_another():
+    """Blotches as wide as fingers made one finger of every hand pale and the next one red."""
+    hand = bundled_hand()
+    finger, palm = torch.from_numpy(finger_of(hand.segment.numpy())), label_regions(hand).palm > 0.95
+    for seed in range(3):
+        blood = flush_shade(hand, seed)[:, 1]
+        means = torch.stack([blood[palm & (finger == k)].mean() for k in range(1, 6)])
+        assert float(means.max() - means.min()) < 0.015
+
+
 def test_nails_are_where_the_hand_model_has_them(hand):
     index = torch.arange(len(hand.template))
     detail = sample_detail(hand, at_places(index, index[:0], torch.zeros(0, 3)), 0)
@@ -61,8 +72,8 @@ def test_palm_lines_are_one_persons_and_take_turns_with_the_seed(hand):
     torch.testing.assert_close(lines[0], lines[2])
     torch.testing.assert_close(lines[1], lines[3])
     palm = (hand.segment == 0) & (skin_regions(hand).palm > 0.95)
-    dark = [line[palm] > 0.5 for line in lines[:2]]
-    assert all(0.02 < float(where.float().mean()) < 0.3 for where in dark)
+    dark = [line[palm] > 0.3 for line in lines[:2]]
+    assert all(0.01 < float(where.float().mean()) < 0.2 for where in dark)
     assert not torch.equal(*dark)
 
 
