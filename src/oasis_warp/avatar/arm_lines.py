@@ -65,7 +65,10 @@ def _wave(rng: np.random.Generator, place: np.ndarray, length: float) -> np.ndar
     order, turns = np.arange(1, 6), np.arange(TABLE + 1)[:, None] / TABLE
     heights, phases = rng.normal(size=5) / order / 1.2, rng.uniform(0, 2 * math.pi, 5)
     wave = (heights * np.cos(2 * math.pi * order * turns + phases)).sum(1)
-    return np.interp(place / length % 1, turns[:, 0], wave)
+    steps = place * (TABLE / length)
+    before = np.floor(steps)
+    at = before.astype(int) % TABLE
+    return wave[at] + (steps - before) * np.diff(wave)[at]
 
 
 def _bump(distance: np.ndarray, width: float | np.ndarray) -> np.ndarray:

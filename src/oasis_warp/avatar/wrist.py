@@ -12,10 +12,10 @@ from oasis_warp.avatar.anchors import (
     RIM_FADE,
     THICKNESS,
     VERTEX_SPREAD,
-    batch_anchors,
     centers_at_rest,
     rim_fade,
     surface_frames,
+    vertex_shapes,
     vertex_to_gaussians,
 )
 from oasis_warp.avatar.appearance import skin_regions
@@ -77,8 +77,9 @@ def close_wrist(
         seed: Of the arm's skin.
     """
     faces, rim = hand.faces.to(rest.device), hand.rim.to(rest.device)
-    full = batch_anchors(rest[None], faces, surface.faces_of_vertices(faces, len(rest)), rim)
-    at_vertices, at_faces = full.fade[0].split([len(rest), len(faces)])
+    quats, scales = vertex_shapes(rest, faces, surface.faces_of_vertices(faces, len(rest)))
+    at_vertices = rim_fade(rest[None], rim)[0]
+    at_faces = at_vertices[faces].mean(1)
     own = torch.cat([at_vertices[gaussians.vertex_index], at_faces[gaussians.face_index]])
     kept = gaussians._replace(opacities=(gaussians.opacities / own.clamp_min(END)).clamp(max=OPACITY))
     kept, n_kept = select(kept, own > END), int((own[: len(gaussians.vertex_index)] > END).sum())
@@ -87,11 +88,10 @@ def close_wrist(
     parts = torch.zeros_like(hand.faces[:, 0]).to(rest.device)
     parts[on_faces] = parts_for_spacing(rest, faces[on_faces], spacing)
     on_faces, places, face_quats, face_scales = cut_faces(rest, faces, parts, SKIN)
-    made = fading_arm(rest.cpu(), rim.cpu(), spacing)  # hundreds of small rings, slow on a GPU
-    *arm, arm_opacities = (part.to(rest.device) for part in made)
-    end = rim_line(rest, rim, full.quats[0, rim]), arm
+    *arm, arm_opacities = fading_arm(rest, rim, spacing)
+    end = rim_line(rest, rim, quats[rim]), arm
     index, offsets, end_quats, end_scales = (torch.cat(parts) for parts in zip(*end, strict=True))
-    discs = ground_discs(SKIN.ground * full.scales[0, vertices])
+    discs = ground_discs(SKIN.ground * scales[vertices])
     points = torch.cat([rest[vertices], rest[index] + offsets])
     on_parts = (rest[faces[on_faces]] * places[..., None]).sum(1)
     left = vertex_to_gaussians(shade_left(hand, rest), faces, kept)
@@ -121,7 +121,7 @@ def close_wrist(
         torch.cat([kept.offsets, -GROUND_DEPTH * surface.vertex_normals(rest, faces)[vertices], offsets]),
         torch.cat([kept.face_index, on_faces]),
         torch.cat([kept.barycentrics, places]),
-        joined(kept.quats, torch.cat([full.quats[0, vertices], end_quats]), face_quats),
+        joined(kept.quats, torch.cat([quats[vertices], end_quats]), face_quats),
         joined(kept.scales, torch.cat([discs, end_scales]), face_scales),
         joined(kept.opacities, torch.cat([on_points, arm_opacities]), of_faces),
         joined(kept.colors, *read),
@@ -202,54 +202,58 @@ def fading_arm(
     n_rings = round(inner / FILL_STEP)
     places = [(k + 0.5) / n_rings * inner / radius for k in range(n_rings)]
     fill = [(height / ARM_LENGTH, place, FILL_STEP) for height in sections for place in places]
-    index, offsets, normals, tangents, scales, opacities = [], [], [], [], [], []
-    for k, (share, out, length) in enumerate(walls + fill):
-        rows, arm, outward, tangent, flare = _ring(edge, axis, length / out, 0.5 * (k % 2), slopes)
-        index.append(rows)
-        height, wide = share * ARM_LENGTH, out * (1 + ARM_GROWTH * share**2)
-        left = math.exp(-height / STRAIGHT)
-        offsets.append(edge.mean(0) + wide * arm + out * STRAIGHT * (1 - left) * flare + height * axis - edge[rows])
-        inside, outward = out < 1, normalize(outward, dim=-1)
-        tilt = left * (flare * outward).sum(1, keepdim=True) * axis
-        normals.append(axis.expand_as(arm) if inside else normalize(outward - tilt, dim=-1))
-        tangents.append(tangent)
-        scales.append(_balls(length, arm) if inside else _discs(length, arm))
-        seen, layers = OPACITY * (1 - share) ** 2 * (1 + 2 * share), FILL_LAYERS if inside else ARM_LAYERS
-        opacities.append(torch.full_like(arm[:, 0], 1 - (1 - seen) ** (1 / layers)))
-    quats = surface_frames(torch.cat(normals), torch.cat(tangents))
-    return rim[torch.cat(index)], torch.cat(offsets), quats, torch.cat(scales), torch.cat(opacities)
+    share, out, length = torch.tensor(walls + fill, dtype=torch.float64, device=rest.device).T
+    inside, height = out < 1, share * ARM_LENGTH
+    ring, index, arm, outward, tangent, flare = _rings(edge, axis, length / out, slopes)
+
+    def at_points(of_rings: Tensor) -> Float[Tensor, "M D"]:
+        return of_rings.reshape(len(out), -1)[ring].to(rest)
+
+    wide, left = out * (1 + ARM_GROWTH * share.square()), (-height / STRAIGHT).exp()
+    turned = at_points(out * STRAIGHT * (1 - left)) * flare
+    offsets = edge.mean(0) + at_points(wide) * arm + turned + at_points(height) * axis - edge[index]
+    outward = normalize(outward, dim=-1)
+    tilt = at_points(left) * (flare * outward).sum(1, keepdim=True) * axis
+    normals = torch.where(inside[ring, None], axis, normalize(outward - tilt, dim=-1))
+    scales = torch.where(inside[:, None], _balls(length), _discs(length))
+    seen, layers = OPACITY * (1 - share).square() * (1 + 2 * share), torch.where(inside, FILL_LAYERS, ARM_LAYERS)
+    opacities = 1 - (1 - seen) ** (1 / layers)
+    return rim[index], offsets, surface_frames(normals, tangent), at_points(scales), at_points(opacities)[:, 0]
 
 
-def _ring(
-    edge: Float[Tensor, "R 3"], axis: Float[Tensor, "3"], length: float, shift: float, *fields: Float[Tensor, "R 3"]
+def _rings(
+    edge: Float[Tensor, "R 3"], axis: Float[Tensor, "3"], lengths: Float[Tensor, "K"], *fields: Float[Tensor, "R 3"]
 ) -> tuple[Tensor, ...]:
-    """Points about `length` apart on the rim: the nearest of its points, arms from its middle, outward, along it.
+    """K rings of points on the rim, in each about a length apart: ring, nearest point of the rim, arm, outward, along.
 
-    After these, each [M] or [M, 3], come the `fields` of the rim's points, interpolated.
+    Every other ring is shifted by half a length; arms start in the middle. After these, each [M] or [M, 3], come the
+    `fields` of the rim's points, interpolated.
     """
     arms, n = edge - edge.mean(0), len(edge)
     along = arms.roll(-1, 0) - arms.roll(1, 0)
     outward = torch.linalg.cross(along, axis.expand_as(along))
     outward = outward * torch.sign((outward * arms).sum())
     around = float((edge - edge.roll(1, 0)).norm(dim=1).sum())
-    count = max(1, round(around / length))
-    place = (torch.arange(count, device=edge.device) + shift) * (n / count)
+    counts = (around / lengths).round().long().clamp_min(1)
+    ring = torch.arange(len(counts), device=edge.device).repeat_interleave(counts)
+    number = torch.arange(len(ring), device=edge.device) - (counts.cumsum(0) - counts)[ring]
+    place = (number + 0.5 * (ring % 2)) * (n / counts)[ring]
     first, second = place.long() % n, (place.long() + 1) % n
     between = (place - place.floor()).to(arms)[:, None]
     known = torch.cat([arms, outward, along, *fields], 1)
     read = torch.lerp(known[first], known[second], between).split(3, 1)
-    return torch.where(between[:, 0] < 0.5, first, second), *read
+    return ring, torch.where(between[:, 0] < 0.5, first, second), *read
 
 
-def _discs(length: float, rows: Float[Tensor, "M D"]) -> Float[Tensor, "M 3"]:
-    """Scales of flat Gaussians that lie `length` apart, one for each of the rows."""
-    spread = WALL_SPREAD * VERTEX_SPREAD * length / math.sqrt(math.pi)
-    return rows.new_tensor([spread, spread, THICKNESS * spread]).expand(len(rows), 3)
+def _discs(lengths: Float[Tensor, "K"]) -> Float[Tensor, "K 3"]:
+    """Scales of flat Gaussians that lie `lengths` apart."""
+    spread = WALL_SPREAD * VERTEX_SPREAD * lengths / math.sqrt(math.pi)
+    return torch.stack([spread, spread, THICKNESS * spread], 1)
 
 
-def _balls(length: float, rows: Float[Tensor, "M D"]) -> Float[Tensor, "M 3"]:
+def _balls(lengths: Float[Tensor, "K"]) -> Float[Tensor, "K 3"]:
     """The same of balls."""
-    return rows.new_tensor(FILL_SPREAD * length).expand(len(rows), 3)
+    return FILL_SPREAD * lengths[:, None].expand(-1, 3)
 
 
 def select(gaussians: CanonicalGaussians, kept: Bool[Tensor, "N"]) -> CanonicalGaussians:
