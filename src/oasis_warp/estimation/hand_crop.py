@@ -16,7 +16,7 @@ from oasis_warp.core.mirror import as_right_hand
 from oasis_warp.core.types import Camera, CanonicalGaussians, HandCrop, HandFit, Photo, PosedHand, SurfaceReading
 from oasis_warp.data.square_crop import resample_square, square_around
 from oasis_warp.estimation.outline import wrist_line
-from oasis_warp.estimation.surface_offsets import outline_offsets, rendered_outline_offsets
+from oasis_warp.estimation.surface_offsets import ThinSheet, outline_offsets, rendered_outline_offsets
 from oasis_warp.hand.skinning import rest_hand, skin
 from oasis_warp.hand.template import chosen_hand
 
@@ -38,6 +38,8 @@ class Surfaces(NamedTuple):
     """The avatar's, nearest to all outlines at once."""
     own: list[Float[Tensor, "V 3"]]
     """One for each photo, by which it is read: on its own outline no background gets on the hand."""
+    sheets: Sequence[ThinSheet] = ()
+    """With which they were found, until they are refined: those of `own`, then that of `shared` if it is another."""
 
 
 def crop_side(fit: HandFit) -> float:
@@ -69,18 +71,19 @@ def finer_size(fit: HandFit, config: ReconstructConfig) -> int | None:
     return size if config.light != "even" and size > COARSE_SIZE else None
 
 
-def initial_offsets(hand: HandModel, *fits: HandFit) -> Float[Tensor, "V 3"]:
+def initial_offsets(hand: HandModel, *fits: HandFit, sheet: ThinSheet | None = None) -> Float[Tensor, "V 3"]:
     """Offsets from the fitted rest surface onto the photos' outlines and then inwards [m].
 
-    The inset suits pictures as fine as the finest of the photos.
+    The inset suits pictures as fine as the finest of the photos. `sheet` as in `outline_offsets`.
     """
-    return outline_offsets(hand, *fits) + inset_offsets(hand, max(map(native_size, fits)))
+    return outline_offsets(hand, *fits, sheet=sheet) + inset_offsets(hand, max(map(native_size, fits)))
 
 
 def initial_surfaces(hand: HandModel, fits: Sequence[HandFit]) -> Surfaces:
     """`initial_offsets` of all fits together and of each."""
-    own = [initial_offsets(hand, fit) for fit in fits]
-    return Surfaces(own[0] if len(own) == 1 else initial_offsets(hand, *fits), own)
+    sheets = [ThinSheet(hand) for _ in range(len(fits) + (len(fits) > 1))]
+    own = [initial_offsets(hand, fit, sheet=sheet) for fit, sheet in zip(fits, sheets, strict=False)]
+    return Surfaces(own[0] if len(own) == 1 else initial_offsets(hand, *fits, sheet=sheets[-1]), own, sheets)
 
 
 def refine_surfaces(
@@ -89,12 +92,13 @@ def refine_surfaces(
 ) -> Surfaces:  # fmt: skip
     """Move the surfaces until the prior's guesses, drawn on them, have the outlines of their photos."""
 
-    def refined(offsets: Tensor, *indices: int) -> Tensor:
+    def refined(offsets: Tensor, sheet: ThinSheet, *indices: int) -> Tensor:
         crops = [crop_hand(photos[k], fits[k], offsets, config, detail_size(fits[k], config)) for k in indices]
-        return offsets + rendered_outline_offsets(hand, [guesses[k] for k in indices], crops).cpu()
+        return offsets + rendered_outline_offsets(hand, [guesses[k] for k in indices], crops, sheet).cpu()
 
-    own = [refined(offsets, k) for k, offsets in enumerate(surfaces.own)]
-    return Surfaces(own[0] if len(own) == 1 else refined(surfaces.shared, *range(len(photos))), own)
+    sheets = surfaces.sheets
+    own = [refined(offsets, sheets[k], k) for k, offsets in enumerate(surfaces.own)]
+    return Surfaces(own[0] if len(own) == 1 else refined(surfaces.shared, sheets[-1], *range(len(photos))), own)
 
 
 def crop_hand(

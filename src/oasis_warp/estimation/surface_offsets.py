@@ -66,7 +66,7 @@ _CLOSE = 12.0
 """Distance up to which outlines are looked for first [px]; nearly all are found there."""
 
 
-def outline_offsets(hand: HandModel, *fits: HandFit) -> Float[Tensor, "V 3"]:
+def outline_offsets(hand: HandModel, *fits: HandFit, sheet: "ThinSheet | None" = None) -> Float[Tensor, "V 3"]:
     """Displacement of the rest surface that brings the outlines of the posed mesh onto the masks' [m].
 
     Add it to the vertices at rest (`skinning.rest_hand`) before skinning. For a left hand, add it before mirroring, as
@@ -76,9 +76,9 @@ def outline_offsets(hand: HandModel, *fits: HandFit) -> Float[Tensor, "V 3"]:
     Args:
         hand: The model.
         fits: One photo of a hand, or several photos of one hand with one shape, which share the displacement.
+        sheet: What to solve with, where `rendered_outline_offsets` of the same photos follows.
     """
-    views = [_View(hand, fit) for fit in fits]
-    sheet = ThinSheet(views[0].kinematics.faces, len(views[0].kinematics.template))
+    views, sheet = [_View(hand, fit) for fit in fits], sheet or ThinSheet(hand)
     offsets = np.zeros_like(views[0].rest)
     longest = np.minimum(LONGEST, OF_FINGER * flesh_thickness(hand))[:, None]
     for _ in range(_ROUNDS):
@@ -92,20 +92,22 @@ def outline_offsets(hand: HandModel, *fits: HandFit) -> Float[Tensor, "V 3"]:
 
 @torch.no_grad()
 def rendered_outline_offsets(
-    hand: HandModel, guesses: Sequence[CanonicalGaussians], crops: Sequence[HandCrop]
-) -> Float[Tensor, "V 3"]:
+    hand: HandModel, guesses: Sequence[CanonicalGaussians], crops: Sequence[HandCrop],
+    sheet: "ThinSheet | None" = None,
+) -> Float[Tensor, "V 3"]:  # fmt: skip
     """Displacement of the rest surface that brings the outlines of Gaussians on it onto the masks' [m].
 
     Args:
         hand: The model.
         guesses: Gaussians for each photo. Colours play no part, neither theirs nor the photos'.
         crops: Photos of one hand with one surface at rest, at the size of the images that will be rendered.
+        sheet: That of `outline_offsets` of these photos: vertices on the outline are nearly the same.
     """
     faces, like = hand.faces.to(crops[0].mask.device), crops[0].rest.vertices
     normals = [
         [surface.vertex_normals(part.vertices, faces) for part in (crop.rest, crop.posed)] for crop in crops
     ]
-    sheet = ThinSheet(hand.faces.cpu().numpy(), len(hand.template))
+    sheet = sheet or ThinSheet(hand)
     outward = np.zeros(len(hand.template))
     for _ in range(_RENDERED_ROUNDS):
         step = torch.from_numpy(outward).to(like)[:, None]
@@ -250,16 +252,17 @@ def _nearest_fall(image: np.ndarray, start: np.ndarray, outward: np.ndarray, t: 
 class ThinSheet:
     """The surface as a sheet that resists bending, and is drawn to targets at some of its vertices."""
 
-    def __init__(self, faces: np.ndarray, n_vertices: int):
-        self._stiffness, self._order = _bending(np.ascontiguousarray(faces, np.int64).tobytes(), n_vertices)
+    def __init__(self, hand: HandModel):
+        faces = np.ascontiguousarray(hand.faces.cpu().numpy(), np.int64)
+        self._stiffness, self._order = _bending(faces.tobytes(), len(hand.template))
         self._factors: SuperLU | None = None
-        self._last: np.ndarray | None = None
+        self._last = np.zeros(0)
 
     def solve(self, vertices: np.ndarray, target: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """The displacement [V, D] that comes nearest to the targets [K, D] of some vertices [K].
 
-        By conjugate gradients from the last solution. Float32 factors of the first system precondition all of them:
-        later ones have targets at nearly the same vertices, and a few iterations take less time than other factors.
+        By conjugate gradients from the last solution of D columns. Float32 factors of the first system precondition all
+        of them: later ones have targets at nearly the same vertices, and some iterations take less time than factors.
         Those of the sheet without targets, which could be kept for all photos, take three times as many iterations,
         more than they save.
         """
@@ -278,8 +281,8 @@ class ThinSheet:
             return factors.solve(residual.astype(np.float32)).astype(np.float64)
 
         solution, _ = cg(
-            _operator(system, right.shape), right.ravel(), self._last, M=_operator(precondition, right.shape),
-            rtol=_TOLERANCE, maxiter=_MAX_STEPS,
+            _operator(system, right.shape), right.ravel(), self._last if self._last.size == right.size else None,
+            M=_operator(precondition, right.shape), rtol=_TOLERANCE, maxiter=_MAX_STEPS,
         )  # fmt: skip
         self._last = solution
         found = np.empty_like(right)
