@@ -16,7 +16,7 @@ from oasis_warp.estimation.fit_problem import FitState, FitTarget, Linearized
 from oasis_warp.estimation.gesture_prior import gesture_prior
 from oasis_warp.estimation.landmarks import BONES
 from oasis_warp.estimation.least_squares import Damping, QuadraticModel, cauchy, charbonnier, minimize
-from oasis_warp.hand.kinematics import HandKinematics, PosedJoints, rotation_between, unit
+from oasis_warp.hand.kinematics import HandKinematics, PosedJoints, cross_matrices, rotation_between, unit
 
 _PALM = [0, *KNUCKLES]
 _DAMPING = Damping(start=1e-2, grow=4, shrink=3, least=1e-6, floor=1e-6)
@@ -378,11 +378,3 @@ class Fitter:
                 scale = np.sqrt((b**2).sum() / (a**2).sum())
                 starts.append(self._centred(replace(state, rotation=rotation), float(np.log(state.focal / scale))))
         return starts
-
-
-def cross_matrices(vectors: np.ndarray) -> np.ndarray:
-    """Matrices that take the cross product of each vector with another one, [P, 3, 3]."""
-    matrices = np.zeros((len(vectors), 3, 3))
-    for a, b, c in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        matrices[:, b, a], matrices[:, a, b] = vectors[:, c], -vectors[:, c]
-    return matrices

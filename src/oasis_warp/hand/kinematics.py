@@ -7,7 +7,6 @@ end joints of fingers only flex. The wrist does not move, because the fit's came
 import functools
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 
@@ -81,6 +80,11 @@ class HandKinematics:
             while a >= 0:
                 self.below[a, j] = 1
                 a = self.parents[a]
+        depth = self.below.sum(0)
+        self.levels = [np.flatnonzero(depth == level) for level in range(2, int(depth.max()) + 1)]
+        """Joints below the wrist, then those below them, and so on."""
+        self.turns = cross_matrices(unit(self.axes))
+        """Of the axes, [16, 3, 3, 3]."""
 
     @staticmethod
     def _free_axes(joint: int) -> tuple[int, ...]:
@@ -116,16 +120,17 @@ class HandKinematics:
         rotation, position = np.zeros((16, 3, 3)), np.zeros((16, 3))
         by_shape, axes = np.zeros((16, 3, len(shape))), np.zeros((16, 3, 3))
         rotation[0], position[0], by_shape[0] = np.eye(3), rest[0], self.joint_basis[0]
-        for j in range(1, 16):
-            parent = self.parents[j]
+        angles = (table * np.linalg.norm(self.axes, axis=2))[..., None, None]
+        about = np.eye(3) + np.sin(angles) * self.turns + (1 - np.cos(angles)) * (self.turns @ self.turns)
+        before = np.stack([np.broadcast_to(np.eye(3), (16, 3, 3)), about[:, 0], about[:, 0] @ about[:, 1]], 1)
+        bent, own_axes = before[:, 2] @ about[:, 2], (before @ self.axes[..., None])[..., 0]
+        for own in self.levels:
+            parent = np.array(self.parents)[own]
             frame = rotation[parent]
-            position[j] = position[parent] + frame @ (rest[j] - rest[parent])
-            by_shape[j] = by_shape[parent] + frame @ (self.joint_basis[j] - self.joint_basis[parent])
-            for a in range(3):
-                axes[j, a] = frame @ self.axes[j, a]
-                if table[j, a] != 0:
-                    frame = frame @ cv2.Rodrigues(self.axes[j, a] * table[j, a])[0]
-            rotation[j] = frame
+            position[own] = position[parent] + (frame @ (rest[own] - rest[parent])[..., None])[..., 0]
+            by_shape[own] = by_shape[parent] + frame @ (self.joint_basis[own] - self.joint_basis[parent])
+            axes[own] = own_axes[own] @ frame.transpose(0, 2, 1)
+            rotation[own] = frame @ bent[own]
         return PosedJoints(table, shape, rest, rotation, position, by_shape, axes)
 
     def landmarks(self, joints: PosedJoints) -> tuple[np.ndarray, np.ndarray]:
@@ -179,36 +184,45 @@ class HandKinematics:
         """`places` and d places / d (angles, shape); the `displacement` [P, 3] stays constant."""
         basis = self.shape_basis[index]
         start, weights = self.template[index] + basis @ joints.shape + displacement, self.weights[index]
-        shifts, frame = self.bone_shifts(joints), self.blended(joints, index)
-        points = (frame @ start[..., None])[..., 0] + weights @ shifts
-        dof_joint = self.dofs[:, 0]
-        below = self.below[dof_joint].T  # bone, angle
-        # Each bone's part of the vertex rotates about the joint of the angle if the bone descends from it.
-        shares = weights[:, :, None] * ((joints.rotation @ start.T).transpose(2, 0, 1) + shifts)
-        moved = np.einsum("nja,jd->nda", shares, below, optimize=True)
-        arm = moved - (weights @ below)[..., None] * joints.position[dof_joint]
-        by_angle = np.cross(joints.axes[tuple(self.dofs.T)], arm)
+        shares = (start @ joints.rotation.reshape(48, 3).T + self.bone_shifts(joints).ravel()) * weights.repeat(3, 1)
+        slopes, at_joints = self._slopes_of_shares(joints)
+        by_angle = shares @ slopes - weights @ at_joints
         shift_by_shape = joints.position_by_shape - joints.rotation @ self.joint_basis
-        by_shape = frame @ basis + np.tensordot(weights, shift_by_shape, 1)
-        return points, np.concatenate([by_angle.transpose(0, 2, 1), by_shape], 2)
+        by_shape = self.blended(joints, index) @ basis + np.tensordot(weights, shift_by_shape, 1)
+        return shares.reshape(-1, 16, 3).sum(1), np.concatenate([by_angle.reshape(-1, 3, len(self.dofs)), by_shape], 2)
 
     def normals(self, joints: PosedJoints, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Posed normals of vertices of the mean hand, [P, 3], and d normals / d angles, [P, 3, 26]."""
-        rest, weights = self.rest_normals[index], self.weights[index]
-        shares = weights[:, :, None] * (joints.rotation @ rest.T).transpose(2, 0, 1)
-        normals = shares.sum(1)
+        shares = (self.rest_normals[index] @ joints.rotation.reshape(48, 3).T) * self.weights[index].repeat(3, 1)
+        normals = shares.reshape(-1, 16, 3).sum(1)
         length = np.linalg.norm(normals, axis=1)[:, None]
-        moved = np.einsum("nja,jd->nda", shares, self.below[self.dofs[:, 0]].T, optimize=True)
-        by_angle = np.cross(joints.axes[tuple(self.dofs.T)], moved)
-        normals, by_angle = normals / length, by_angle / length[:, None]
-        by_angle -= normals[:, None] * (by_angle @ normals[..., None])
-        return normals, by_angle.transpose(0, 2, 1)
+        normals, by_angle = normals / length, shares @ self._slopes_of_shares(joints)[0] / length
+        by_angle = by_angle.reshape(-1, 3, len(self.dofs))
+        return normals, by_angle - normals[..., None] * (normals[:, None] @ by_angle)
+
+    def _slopes_of_shares(self, joints: PosedJoints) -> tuple[np.ndarray, np.ndarray]:
+        """Slopes by the angles of the bones' parts of a place, [48, 3 * 26], and of their weights, [16, 3 * 26].
+
+        Each part turns about the joint of the angle if its bone descends from that.
+        """
+        joint, below = self.dofs[:, 0], self.below[self.dofs[:, 0]].T
+        turns = cross_matrices(joints.axes[tuple(self.dofs.T)]).transpose(2, 1, 0)  # from, to, angle
+        at_joints = (turns * joints.position[joint].T[:, None]).sum(0)
+        return (below[:, None, None] * turns).reshape(48, -1), (below[:, None] * at_joints).reshape(16, -1)
 
 
 @functools.cache
 def bundled_kinematics() -> HandKinematics:
     """Kinematics of the bundled mean hand."""
     return HandKinematics(bundled_hand())
+
+
+def cross_matrices(vectors: np.ndarray) -> np.ndarray:
+    """Matrices that take the cross product of each vector with another one, [..., 3, 3]."""
+    matrices = np.zeros((*vectors.shape, 3))
+    for a, b, c in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        matrices[..., b, a], matrices[..., a, b] = vectors[..., c], -vectors[..., c]
+    return matrices
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
