@@ -20,6 +20,7 @@ auto store_row = [](float* p, Q v) { *(QU*)p = v; };
 auto root = [](V v) -> V { return __builtin_elementwise_sqrt(v); };
 #include "algebra.h"
 auto largest = [](V a, V b) -> V { return a > b ? a : b; };
+auto smallest = [](V a, V b) -> V { return a < b ? a : b; };
 auto magnitude = [](V a) -> V { return __builtin_elementwise_abs(a); };
 // The power of two at or below a positive number, and the inverse of a power of two.
 auto power_below = [](V a) -> V { return __builtin_bit_cast(V, __builtin_bit_cast(I, a) & (I)(0x7f800000)); };

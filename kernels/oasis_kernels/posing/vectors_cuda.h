@@ -9,6 +9,7 @@ struct __align__(16) V4 {
 const float zero = 0.f, one = 1.f;
 auto root = [](float a) -> float { return sqrtf(a); };
 auto largest = [](float a, float b) -> float { return fmaxf(a, b); };
+auto smallest = [](float a, float b) -> float { return fminf(a, b); };
 auto magnitude = [](float a) -> float { return fabsf(a); };
 auto power_below = [](float a) -> float { return __int_as_float(__float_as_int(a) & 0x7f800000); };
 auto inverse_power = [](float a) -> float { return __int_as_float(0x7f000000 - __float_as_int(a)); };

@@ -69,7 +69,7 @@ void light_gaussians(
                 for (int c = 0; any && c < 3; c++) color[c] *= exponential(load(change[c]));
             }
             const V3 skin = get3(colors + 3ll * i, count);
-            auto clamped = [&](V x) -> V { return lower(upper(x, zero), one); };
+            auto clamped = [&](V x) -> V { return smallest(largest(x, zero), one); };
             const V3 lit = {clamped(skin.x * color[0]), clamped(skin.y * color[1]), clamped(skin.z * color[2])};
             put3(out + 3 * ((long long)b * n + i), count, lit);
         }

@@ -1,12 +1,10 @@
 // The colours of Gaussians in the light of the vertices around them: `avatar.pose.lit_in_steps` in one text for the CPU
 // and CUDA. V is a number, or 16 of them in a vector.
-auto upper = [](V a, V b) -> V { return a > b ? a : b; };
-auto lower = [](V a, V b) -> V { return a < b ? a : b; };
 // Shares of both kinds of shade leave so much of the Gaussian's own.
 auto shaded = [&](const V* own, V deep, V weak, V* color) {
     const V beyond[3] = {own[0] - 1.f, own[1] - 1.f, own[2] - 1.f};
-    const V most = upper(magnitude(beyond[0]), upper(magnitude(beyond[1]), magnitude(beyond[2])));
-    const V share = lower(upper((most - bounds[0]) * (1.f / (bounds[1] - bounds[0])), zero), one);
+    const V most = largest(magnitude(beyond[0]), largest(magnitude(beyond[1]), magnitude(beyond[2])));
+    const V share = smallest(largest((most - bounds[0]) * (1.f / (bounds[1] - bounds[0])), zero), one);
     const V stays = weak + (deep - weak) * share;
     for (int c = 0; c < 3; c++) color[c] *= 1.f + stays * beyond[c];
 };

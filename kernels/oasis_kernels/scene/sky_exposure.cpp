@@ -22,10 +22,9 @@ void expose(
 #include "sky_light.h"
     typedef int J __attribute__((ext_vector_type(4)));
     const float FAR = 1e30f;
-    auto lower = [](V a, V b) -> V { return a < b ? a : b; };
     const I lane = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
     // Numbers that are none become `low`: no index is made of them.
-    auto clamped = [&](V a, float low, float high) -> V { return lower(a > low ? a : (V)(low), (V)(high)); };
+    auto clamped = [&](V a, float low, float high) -> V { return smallest(a > low ? a : (V)(low), (V)(high)); };
     auto along = [](const float* axis, V x, V y, V z) -> V { return axis[0] * x + axis[1] * y + axis[2] * z; };
 
     phase(state, batch, [&](long long b) {
@@ -96,7 +95,7 @@ void expose(
                 }
                 corner[j][0] = load(u), corner[j][1] = load(v), corner[j][2] = load(w);
             }
-            auto least = [&](int c) -> V { return lower(corner[0][c], lower(corner[1][c], corner[2][c])); };
+            auto least = [&](int c) -> V { return smallest(corner[0][c], smallest(corner[1][c], corner[2][c])); };
             auto most = [&](int c) -> V { return largest(corner[0][c], largest(corner[1][c], corner[2][c])); };
             const V left = __builtin_elementwise_ceil(clamped(least(0), 0.f, SIZE));
             const V last = __builtin_elementwise_floor(clamped(most(0), -1.f, SIZE - 1));
@@ -144,7 +143,7 @@ void expose(
             const V v = load(lines + i) + LIFT * scale * along(down, a, c, d);
             const V depth = load(depths + i) - LIFT * cosine;
             const V tangent = root(largest(one - size * size, zero)) / (size > 0.f ? size : one);
-            const V bias = LIFT + lower(tangent, (V)(STEEPEST)) * texel;
+            const V bias = LIFT + smallest(tangent, (V)(STEEPEST)) * texel;
             const V column = __builtin_elementwise_floor(clamped(u, -1.f, SIZE));
             const V row = __builtin_elementwise_floor(clamped(v, -1.f, SIZE));
             const V part_x = u - column, part_y = v - row;
@@ -184,7 +183,7 @@ void expose(
             }
             V of[4];
             for (int j = 0; j < 4; j++)
-                of[j] = whole[j] > LEAST ? lower(seen[j] / (whole[j] > LEAST ? whole[j] : one), one) : one;
+                of[j] = whole[j] > LEAST ? smallest(seen[j] / (whole[j] > LEAST ? whole[j] : one), one) : one;
             put4(rough + 4 * (b * n_vertices + i), wp::min(16, n_vertices - i), {of[0], of[1], of[2], of[3]});
         }
     });

@@ -67,7 +67,7 @@ void light_vertices(
             for (int c = 0; c < 3; c++) color[c] = power(color[c], 1.f / gamma);
             if (in_photo) {
                 weak = faces_alike(n, get3(in_photo + 3ll * i, count));
-                deep = weak * ramp(fixed(agreement[b]), fixed(other_pose), fixed(same_pose));
+                deep = weak * ramp((V)(agreement[b]), (V)(other_pose), (V)(same_pose));
                 if (seen) {
                     float around[16];
                     for (int lane = 0; lane < count; lane++) {

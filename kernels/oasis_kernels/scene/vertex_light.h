@@ -4,13 +4,10 @@ const float gamma = rules[0], deep_inside = rules[10], outside = rules[11];
 const float turned_away = rules[12], facing_alike = rules[13], other_pose = rules[14], same_pose = rules[15];
 const float same_sky = rules[16], other_sky = rules[17], same_beside = rules[18], other_beside = rules[19];
 const float *least_light = rules + 1, *in_hollows = rules + 4, *in_crevices = rules + 7;
-auto upper = [](V a, V b) -> V { return a > b ? a : b; };
-auto lower = [](V a, V b) -> V { return a < b ? a : b; };
 // 0 at `from`, 1 at `to`, straight between them.
-auto ramp = [&](V x, V from, V to) -> V { return lower(upper((x - from) / (to - from), zero), one); };
-auto fixed = [&](float x) -> V { return zero + x; };
-auto faces_alike = [&](V3 n, V3 before) -> V { return ramp(dot3(n, before), fixed(turned_away), fixed(facing_alike)); };
-auto more_sky = [&](V now, V before) -> V { return upper(now - before, zero); };
+auto ramp = [&](V x, V from, V to) -> V { return smallest(largest((x - from) / (to - from), zero), one); };
+auto faces_alike = [&](V3 n, V3 before) -> V { return ramp(dot3(n, before), (V)(turned_away), (V)(facing_alike)); };
+auto more_sky = [&](V now, V before) -> V { return largest(now - before, zero); };
 // Of red, green and blue.
 auto received = [&](V3 n, int c) -> V {
     const float* h = harmonics + c;
@@ -19,15 +16,15 @@ auto received = [&](V3 n, int c) -> V {
         total += h[12] * n.x * n.y + h[15] * n.y * n.z + h[18] * (3.f * n.z * n.z - 1.f);
         total += h[21] * n.x * n.z + h[24] * (n.x * n.x - n.y * n.y);
     }
-    return lower(upper(total, fixed(limits[c])), fixed(limits[3 + c]));
+    return smallest(largest(total, (V)(limits[c])), (V)(limits[3 + c]));
 };
 // The share that arrives of it where the sky is seen so far, and that skin close by leaves.
 auto arrives = [&](V sky, V hidden, int c) -> V {
     const float a = 2.0404f * albedo[c] - .3324f, b = .6417f - 4.7951f * albedo[c], d = 2.7552f * albedo[c] + .6903f;
-    const V share = power(upper(sky, ((sky * a + b) * sky + d) * sky), in_hollows[c]);
+    const V share = power(largest(sky, ((sky * a + b) * sky + d) * sky), in_hollows[c]);
     return (least_light[c] + (1.f - least_light[c]) * share) * (1.f - (1.f - in_crevices[c]) * hidden);
 };
-auto hidden_close = [&](V sky, V close) -> V { return close * ramp(sky, fixed(outside), fixed(deep_inside)); };
+auto hidden_close = [&](V sky, V close) -> V { return close * ramp(sky, (V)(outside), (V)(deep_inside)); };
 // Shares of deep and of weak shade that stay where the sky opens by `own`, and by `near` at most nearby.
 auto under_sky = [&](V own, V near, V doubtful, V* deep, V* weak) {
     const V same = same_sky + (same_beside - same_sky) * doubtful;
