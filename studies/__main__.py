@@ -55,12 +55,12 @@ def note_ages(names: list[str], docs: Path, results: Path, write: bool) -> list[
     for name in names:
         study = importlib.import_module(f"studies.{name}")
         files, rows = files_of(name, study), load(name, study, results)
-        noted = age.read_measured(results, name)
-        measured = {file: noted.get(file, age.NOT_NOTED) for file in age.times(results, files)}
-        commits = tables.commits_of(rows) or tables.commits_of(one._asdict() for one in measured.values())
-        for page, marker, text in study.SECTIONS:
+        measured = dict.fromkeys(age.times(results, files), age.NOT_NOTED) | age.read_measured(results, name)
+        for page, marker, text, file in study.SECTIONS:
             if page and (docs / page).is_file():
-                note = age.age_note(measured if rows and text(rows) else {}, age.code_digest(name), commits)
+                own = {file: measured[file]} if file in measured else measured if rows and text(rows) else {}
+                commits = tables.commits_of(rows) or tables.commits_of(one._asdict() for one in own.values())
+                note = age.age_note(own, age.code_digest(name), commits)
                 old = (docs / page).read_text()
                 new = age.noted_page(old, marker, note)
                 missing += [f"{page}: {marker}"] if new != old and age.noted_page(old, marker, "") == old else []

@@ -152,7 +152,7 @@ def hidden_chroma(pairs: list[Record]) -> str:
 
 
 SECTIONS = (
-    section_of("evaluation.md", "synthetic", lambda row: synthetic(row["found"]), dataset="synthetic"),
-    section_of("evaluation.md", "noise", lambda row: noise(row["found"]), dataset="synthetic"),
-    section_of("evaluation.md", "same-hand", lambda row: photos(row["found"]), dataset="same-hand"),
+    section_of("evaluation.md", "synthetic", lambda row: synthetic(row["found"]), FILES[0], dataset="synthetic"),
+    section_of("evaluation.md", "noise", lambda row: noise(row["found"]), FILES[0], dataset="synthetic"),
+    section_of("evaluation.md", "same-hand", lambda row: photos(row["found"]), FILES[1], dataset="same-hand"),
 )

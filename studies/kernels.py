@@ -259,9 +259,9 @@ PARTS = {
     "roofline": Part(KernelRow, {"roofline": roofline_text}, plot_roofline),
 }
 SECTIONS = (
-    Section("kernels.md", "speed", speed_text),
+    Section("kernels.md", "speed", speed_text, "speed.json"),
     *(
-        section_of("gpu.md", marker, lambda row, text=text: text(row["rows"]), part=name)
+        section_of("gpu.md", marker, lambda row, text=text: text(row["rows"]), f"gpu/{name}.json", part=name)
         for name, part in PARTS.items() for marker, text in part.texts.items()
     ),
 )  # fmt: skip

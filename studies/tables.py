@@ -46,16 +46,20 @@ class Section(NamedTuple):
     marker: str
     text: Text
     """What stands there, made of the study's rows; None leaves the page as it is."""
+    file: str | None = None
+    """The file of results that it is made of; None for a study whose files belong together."""
 
 
-def section_of(page: str | None, marker: str, text: Callable[[Row], str], **values: object) -> Section:
+def section_of(
+    page: str | None, marker: str, text: Callable[[Row], str], file: str | None = None, **values: object
+) -> Section:
     """A section made of the one row of a study that has these `values`; left as it is where there is none."""
 
     def filled(rows: list[Row]) -> str | None:
         found = next((row for row in rows if values.items() <= row.items()), None)
         return None if found is None else text(found)
 
-    return Section(page, marker, filled)
+    return Section(page, marker, filled, file)
 
 
 def complete(rows: Iterable[Row]) -> list[Row]:
@@ -185,7 +189,7 @@ def commits_of(rows: Iterable[Row]) -> str:
 def render(sections: Sequence[Section], rows: list[Row], docs: Path) -> list[str]:
     """Fill the sections of a study into the pages below `docs`, and return what was filled."""
     filled = []
-    for page, marker, text in sections:
+    for page, marker, text, _ in sections:
         made = text(rows) if page else None
         if page is None or made is None:
             continue
