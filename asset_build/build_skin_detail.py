@@ -88,6 +88,8 @@ strangers."""
 RIDGE, PALM_RIDGE = 8.0, 5.0
 """Blurs of folds and of the palm's lines that are taken off [finer texels of .3 mm]: skin beside them is a ridge, which
 catches light. Without, a joint was a brown patch, and creases were painted bands."""
+BELOW_SKIN = 2.5
+"""Blur of veins, which shine through the skin [finer texels]."""
 PAD_RIM = 3.0
 """Blur of the border between fingers and palm [texels]."""
 LINES_ON_PADS = 0.9
@@ -135,7 +137,8 @@ def lines(hand: HandModel, faces: np.ndarray, places: np.ndarray) -> np.ndarray:
     drawn = [[draw(number) for number in PEOPLE] for draw in (knuckle_folds, lines_on_palm)]
     folds, palms = (resampled(torch.stack(people, 1), faces, places) for people in drawn)
     folds += palms - mean_around(folds, faces >= 0, RIDGE) - mean_around(palms, faces >= 0, PALM_RIDGE)
-    read = np.concatenate([folds, resampled(veins()[:, None], faces, places)], 2)
+    deep = mean_around(resampled(veins()[:, None], faces, places), faces >= 0, BELOW_SKIN)
+    read = np.concatenate([folds, deep], 2)
     read *= 1 - (1 - LINES_ON_PADS) * finger_pads(hand, faces, places, FINER)[..., None]
     before_wrist = shade_left(hand, hand.template)[:, 0]  # Gaussians stay coarse there, and thin lines would be dots
     read *= on_texels(before_wrist, hand, faces, places)[..., None]
@@ -216,7 +219,8 @@ def sharpened(detail: np.ndarray, on: np.ndarray) -> np.ndarray:
 def mean_around(values: np.ndarray, on: np.ndarray, reach: float) -> np.ndarray:
     """Values blurred by a Gaussian of that standard deviation [texels], without those beside the hand, [H, W, C]."""
     weight = cv2.GaussianBlur(on.astype(np.float64), (0, 0), reach)
-    return cv2.GaussianBlur(values * on[..., None], (0, 0), reach) / np.maximum(weight, 1e-6)[..., None]
+    total = cv2.GaussianBlur(values * on[..., None], (0, 0), reach).reshape(values.shape)  # one channel is dropped
+    return total / np.maximum(weight, 1e-6)[..., None]
 
 
 def even_palm(hand: HandModel, detail: np.ndarray, faces: np.ndarray, places: np.ndarray) -> np.ndarray:

@@ -32,13 +32,13 @@ MAX_DIFFERENT = 0.3
 """Difference of the logarithms from the person's mean colours that is carried on: more is dirt, a ring or a shadow."""
 SHOWS_FORM = 0.3
 """Cosine between normal and view from which a photo shows the forms of skin that it shows on a slant."""
-ON_PALM, ON_BACK = 1.6, 1.25
-"""Gain of the maps' detail on palms and on backs."""
+ON_PALM, ON_BACK = 1.6, 0.9
+"""Gain of the maps' detail on palms and on backs. With 1.25 on backs, which had fainter veins, skin looked mottled."""
 LOUDEST_ON_PALM, LOUDEST_ON_BACK = 0.2, 0.12
 """Logarithms of sRGB that this detail tends to. The maps have the same contrast all over palms, not over backs."""
 LINES_ON_PALM, LINES_ON_BACK = 1.8, 2.6
 """Gain of the drawn lines."""
-FOLD, VEIN = (-0.10, -0.14, -0.15), (-0.07, -0.04, -0.04)
+FOLD, VEIN = (-0.10, -0.14, -0.15), (-0.14, -0.09, -0.09)
 """What a fold and a vein add to the logarithms of the colours."""
 USUAL_CONTRASTS = 0.023, 0.016
 """Median difference of a vertex of a real palm and back from its surroundings, as the logarithm of sRGB: medians of the
