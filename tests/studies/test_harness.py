@@ -296,6 +296,22 @@ def test_tables_say_when_their_code_has_changed(repository, monkeypatch):
     assert "Measured" not in page.read_text()
 
 
+def test_a_table_is_as_old_as_its_own_file(repository, monkeypatch):
+    """Files that are too large to keep count too; one that is old made all tables of its study look old."""
+    docs, results = repository / "docs", repository / "results"
+    sections = tuple(Section("page.md", name, table((Column("value", "value"),)), f"{name}.json") for name in "ab")
+    monkeypatch.setattr(importlib, "import_module", lambda name: type("Study", (), {"SECTIONS": sections}))
+    docs.mkdir()
+    results.mkdir()
+    (docs / "page.md").write_text("<!-- a -->\n| 1 |\n<!-- end of a -->\n<!-- b -->\n| 2 |\n<!-- end of b -->\n")
+    fresh, old = age.MeasuredCode((digest(),), "0123456789"), age.MeasuredCode(("old",), "abcdef0123")
+    age.write_measured(results, "count", {"a.json": fresh, "b.json": old})
+    assert command.note_ages(["count"], docs, results, write=True) == ["page.md: b"]
+    page = (docs / "page.md").read_text()
+    assert page.count("Measured") == 1
+    assert "*Measured at abcdef0123; the code has changed since.*\n<!-- end of b" in page
+
+
 NOTES = {
     "step": 1234, "steps": 2000, "hands": 16, "people": 512, "seed": 3, "precision": "bfloat16", "profile": "compact",
     "hold_out": ["tattoo", "ring"], "losses": {"rgb": 10.0},
