@@ -2,7 +2,7 @@
 
     python asset_build/build_skin_detail.py FOLDER
 
-FOLDER holds the crops that `box` cuts from MakeHuman's body textures of 2048 px (CC0): the hand model was cut from the
+FOLDER holds the crops that `BOX` cuts from MakeHuman's body textures of 2048 px (CC0): the hand model was cut from the
 same body and kept its texture coordinates, moved and scaled, so nothing needs to be registered. Three hands have detail
 of their own and are taken; the light man's, on which several of the other textures are built, is left out to judge by.
 """
@@ -18,7 +18,18 @@ import torch
 from scipy.sparse.linalg import splu
 
 from oasis_warp.adaptation.inpainting import laplacian_and_mass
-from oasis_warp.adaptation.skin_detail import FINER, FORM_UNIT, LOUDEST_LINE, NO_LINE
+from oasis_warp.adaptation.skin_detail import (
+    BODY,
+    BOX,
+    FINER,
+    FORM_UNIT,
+    GREY,
+    LOUDEST_LINE,
+    LOW,
+    NO_LINE,
+    SPAN,
+    UNIT,
+)
 from oasis_warp.avatar.appearance import label_regions
 from oasis_warp.avatar.wrist import shade_left
 from oasis_warp.core.hand_model import HandModel
@@ -40,11 +51,6 @@ HANDS = {
 }
 """With each the gain of its detail: folds of dark skin are darker than those of light skin. The first one's fingers are
 smooth on the palm's side, with red pads in a frame of paint: there it takes the second one's detail."""
-LOW, SPAN = (0.361408, 0.011539), 0.192729
-"""Corner and side of the hand's texture coordinates in those of the body."""
-BOX = (732, 1621, 411, 412)
-"""Column, row, width and height of the crops in the body's texture [px]."""
-BODY_SIZE = 2048
 SMOOTH, ON_FINGERS = 0.008, 0.0045
 """Length l of the low-pass 1 / (1 + (k l)^4) that is taken off, on the palm and back and on fingers [m]: half of what
 repeats every 50 mm and every 28 mm goes. Folds, vessels and red knuckles stay; the gloss along fingers goes."""
@@ -71,8 +77,6 @@ ON_PADS = 0.7
 """Contrast of the palm's side of fingers over that of palms, by eye: with 1 fingers look mottled."""
 RIM = 3.0
 """Width of the islands' rims over which detail fades in: what lies beside them bled into them [texels]."""
-GREY, STEPS = 128, 400
-"""Value of the maps that stands for none, and steps to one of the natural logarithm."""
 PEOPLE = (19, 43)
 """People of the synthetic world whose palm's lines are taken, and the first one's veins. The photos' own lines are
 blurred. Chosen by eye among 46 people, for long and soft lines."""
@@ -121,7 +125,7 @@ def main(folder: Path) -> None:
     share = finger_pads(hand, faces, places)[..., None]
     details[0] = details[0] + share * (details[1] - details[0])
     for k, detail in enumerate(details):
-        stored = np.rint(GREY + STEPS * LOUDEST * np.tanh(detail / LOUDEST)).clip(0, 255).astype(np.uint8)
+        stored = np.rint(GREY + UNIT * LOUDEST * np.tanh(detail / LOUDEST)).clip(0, 255).astype(np.uint8)
         write(target / f"detail_{k}.png", spread_out(stored, faces >= 0))
     faces, places = rasterize(FINER * texel_corners(hand), FINER * BOX[3], FINER * BOX[2])
     write(target / "nails.png", spread_out(nails(hand, faces, places), faces >= 0))
@@ -162,7 +166,7 @@ def write(path: Path, rgb: np.ndarray) -> None:
 def texel_corners(hand: HandModel) -> np.ndarray:
     """Column and row of the corners of each face in the crops, [F, 3, 2]; the first pixel's centre is at .5."""
     atlas = np.array(LOW) + (hand.uv.double().numpy() - 0.01) / 0.98 * SPAN
-    place = np.stack([atlas[:, 0] * BODY_SIZE - BOX[0], (1 - atlas[:, 1]) * BODY_SIZE - BOX[1]], 1)
+    place = np.stack([atlas[:, 0] * BODY - BOX[0], (1 - atlas[:, 1]) * BODY - BOX[1]], 1)
     return place[hand.uv_faces.numpy()]
 
 

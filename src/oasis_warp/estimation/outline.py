@@ -86,8 +86,8 @@ def silhouette(image: np.ndarray, faces: np.ndarray, size: tuple[int, int]) -> n
     """255 where the mesh covers a pixel's centre or its outline meets a pixel, 0 elsewhere, [height, width] bytes.
 
     The number of front faces over a pixel is the winding number of the edges between front faces and others. It fills
-    the inside, so that only the faces along those edges are drawn one by one: to draw all takes two to three times as
-    long and gives the same pixels.
+    the inside, and only the faces along those edges are drawn one by one. To draw all of them takes longer and gives
+    the same pixels, but for one or two inside that long, thin faces miss.
 
     Args:
         image: Projected vertices [px], [V, 2].
