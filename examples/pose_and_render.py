@@ -17,7 +17,6 @@ import tyro
 
 from oasis_warp import Avatar, read_photo, reconstruct
 from oasis_warp.assets import asset
-from oasis_warp.core.camera import orbit_camera
 from oasis_warp.data.pictures import to_uint8, write_picture
 
 
@@ -53,7 +52,7 @@ def main(options: Options) -> None:
         for k in range(options.frames):
             share = k / max(options.frames - 1, 1)
             pose = avatar.source_pose._replace(angles=torch.lerp(first, last, share))
-            camera = orbit_camera(avatar.mesh(pose).vertices, azimuth=1.5 * share, size=options.size)
+            camera = avatar.orbit_camera(pose, azimuth=1.5 * share, size=options.size)
             began = time.perf_counter()
             image = avatar.render(camera, pose).image.cpu()
             seconds += time.perf_counter() - began

@@ -14,7 +14,6 @@ import tyro
 
 from oasis_warp import Avatar, read_photo, reconstruct
 from oasis_warp.assets import asset
-from oasis_warp.core.camera import orbit_camera
 from oasis_warp.data.pictures import to_uint8, write_picture
 
 
@@ -42,7 +41,7 @@ def main(options: Options) -> None:
     avatar = Avatar.load(file)  # from here on, neither photo nor network is needed
 
     pose = avatar.held(options.pose)
-    camera = orbit_camera(avatar.mesh(pose).vertices, azimuth=0.5, size=512)
+    camera = avatar.orbit_camera(pose, azimuth=0.5, size=512)
     write_picture(options.out, to_uint8(avatar.render(camera, pose).image))
     print(f"wrote {file} and {options.out}")
 

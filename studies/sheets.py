@@ -17,7 +17,7 @@ from torch import Tensor
 
 from oasis_warp.adaptation.adapt import adapt
 from oasis_warp.cli.summary import GROUND, Panel, make_sheet, panel_side
-from oasis_warp.core.camera import crop_camera, orbit_camera, project
+from oasis_warp.core.camera import crop_camera, project
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.rotation import from_axis_angle
@@ -97,7 +97,7 @@ def view(avatar: Avatar, pose: HandPose, camera: Camera, side: int, caption: str
 
 def around(avatar: Avatar, pose: HandPose, azimuth: float, side: int, caption: str) -> Panel:
     """The avatar from an azimuth [rad]."""
-    return view(avatar, pose, orbit_camera(avatar.mesh(pose).vertices, azimuth, 0.0, side), side, caption)
+    return view(avatar, pose, avatar.orbit_camera(pose, azimuth, size=side), side, caption)
 
 
 def photographing_rows(config: ReconstructConfig, width: int) -> Rows:

@@ -21,7 +21,8 @@ from oasis_warp.avatar.vertex_light import (
     with_photo,
     with_todays_light,
 )
-from oasis_warp.core.camera import camera_center
+from oasis_warp.avatar.wrist import hand_up
+from oasis_warp.core.camera import camera_center, orbit_camera
 from oasis_warp.core.color import plain_background
 from oasis_warp.core.config import BLACK, WHITE
 from oasis_warp.core.hand_model import MANO_SHAPES, HandModel
@@ -237,6 +238,16 @@ class Avatar:
             self._canonical, self.hand.faces, self._rest_mesh, posed.vertices, self._light, center, bend,
             posed.closeness,
         )  # fmt: skip
+
+    @torch.no_grad()
+    def orbit_camera(self, pose: HandPose | str, azimuth: float, elevation: float = 0.0, size: int = 256) -> Camera:
+        """A camera that frames the hand in `pose`, as `core.camera.orbit_camera` does; it moves around the arm.
+
+        Raises:
+            TypeError, ValueError: `pose` is none, as in `mesh`.
+        """
+        vertices = self.mesh(pose).vertices
+        return orbit_camera(vertices, azimuth, elevation, size, up=hand_up(self.hand, vertices))
 
     @torch.no_grad()
     def shade_share(self, vertices: Float[Tensor, "V 3"], camera: Camera) -> float:

@@ -228,24 +228,20 @@ def test_bad_input_is_one_sentence_and_exits_with_two(capsys, tmp_path):
 
 
 def test_an_interrupt_is_told_and_exits_with_130(capsys, monkeypatch, avatar_file):
-    from oasis_warp.cli import render
-
-    def interrupt(*args):
+    def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(render, "orbit_camera", interrupt)
+    monkeypatch.setattr(Avatar, "orbit_camera", interrupt)
     assert main(["render", str(avatar_file), "-o", str(avatar_file.with_name("x.png"))]) == 130
     assert capsys.readouterr().err == "oasis: stopped, nothing was written.\n"
     assert not avatar_file.with_name("x.png").exists()
 
 
 def test_an_error_of_ours_is_not_dressed_up_as_bad_input(monkeypatch, avatar_file):
-    from oasis_warp.cli import render
-
-    def fail(*args):
+    def fail(*_, **__):
         raise ValueError("a bug")
 
-    monkeypatch.setattr(render, "orbit_camera", fail)
+    monkeypatch.setattr(Avatar, "orbit_camera", fail)
     with pytest.raises(ValueError, match="a bug"):
         main(["render", str(avatar_file), "-o", str(avatar_file.with_name("x.png"))])
 

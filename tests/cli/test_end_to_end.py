@@ -265,12 +265,10 @@ def test_a_full_disk_is_told_and_leaves_no_picture(avatar_file, capsys):
 
 
 def test_full_memory_is_told_in_one_sentence(avatar_file, tmp_path, monkeypatch, capsys):
-    from oasis_warp.cli import render
-
-    def fail(*_):
+    def fail(*_, **__):
         torch.empty(1 << 60, dtype=torch.uint8)
 
-    monkeypatch.setattr(render, "orbit_camera", fail)
+    monkeypatch.setattr(Avatar, "orbit_camera", fail)
     assert main(["render", str(avatar_file), "-o", str(tmp_path / "x.png")]) == 2
     assert capsys.readouterr().err == "oasis: the memory of cpu is full; use smaller sizes, or fewer at once.\n"
     assert what_ran_out(MemoryError()) == what_ran_out(torch.OutOfMemoryError("CUDA error: out of memory"))

@@ -51,6 +51,27 @@ def test_orbit_moves_left_with_azimuth_and_up_with_elevation(points):
     assert float(position(orbit_camera(points, 0.0, 0.3))[1]) < 0  # y points down
 
 
+@pytest.mark.parametrize("up", [(0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (-0.6, 0.8, 0.9)])
+def test_orbit_goes_around_the_part_of_up_that_the_picture_shows(points, up):
+    """A hand that points to the side was seen along its arm from 90 degrees."""
+    up = torch.tensor(up)
+    torch.testing.assert_close(orbit_camera(points, 0.0, up=up).viewmat[:3, :3], torch.eye(3))
+    shown = torch.nn.functional.normalize(up * torch.tensor([1.0, 1.0, 0.0]), dim=0)
+    for azimuth in (0.3, math.pi / 2, math.pi):
+        view = orbit_camera(points, azimuth, up=up).viewmat[:3, :3]
+        torch.testing.assert_close(view @ shown, shown)  # where it was in the picture
+        upright = orbit_camera(points, azimuth).viewmat[:3, :3]
+        assert float(view[2, 2]) == pytest.approx(float(upright[2, 2]), abs=1e-6)  # as far around
+    raised = orbit_camera(points, 0.0, 0.3, up=up).viewmat[2, :3]
+    assert float(raised @ shown) == pytest.approx(-math.sin(0.3), abs=1e-6)
+
+
+@pytest.mark.parametrize("up", [(0.0, 0.0, 0.0), (0.01, 0.01, -1.0)])
+def test_orbit_goes_around_the_vertical_where_up_points_along_the_view(points, up):
+    turned = orbit_camera(points, 0.7, 0.2, up=torch.tensor(up))
+    assert torch.equal(turned.viewmat, orbit_camera(points, 0.7, 0.2).viewmat)
+
+
 def test_a_crop_shows_the_same_points_moved_and_scaled(points, camera):
     uv, _ = project(camera, points)
     cropped, _ = project(crop_camera(camera, 30.5, 40.0, 200.0, 100), points)

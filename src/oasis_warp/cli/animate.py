@@ -9,6 +9,7 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
+from oasis_warp.avatar.wrist import hand_up
 from oasis_warp.cli.options import Animate
 from oasis_warp.cli.progress import Terminal, show_progress
 from oasis_warp.cli.record import written
@@ -105,9 +106,11 @@ def turntable(
 def around(
     hands: Sequence[tuple[Avatar, Sequence[HandPose]]], n_frames: int, size: int, elevation: float
 ) -> list[Camera]:
-    """Cameras on a circle around hands that stand still."""
-    vertices = torch.cat([avatar.mesh(poses[0]).vertices for avatar, poses in hands])
-    return [orbit_camera(vertices, 2 * math.pi * frame / n_frames, elevation, size) for frame in range(n_frames)]
+    """Cameras on a circle around hands that stand still: around the arm of one, around the vertical for two."""
+    meshes = [avatar.mesh(poses[0]).vertices for avatar, poses in hands]
+    up = hand_up(hands[0][0].hand, meshes[0]) if len(hands) == 1 else None
+    azimuths = (2 * math.pi * frame / n_frames for frame in range(n_frames))
+    return [orbit_camera(torch.cat(meshes), azimuth, elevation, size, up=up) for azimuth in azimuths]
 
 
 @torch.no_grad()

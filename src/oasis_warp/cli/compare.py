@@ -15,7 +15,6 @@ from oasis_warp.cli.progress import print_tables
 from oasis_warp.cli.record import note, written
 from oasis_warp.cli.report import MEASURES
 from oasis_warp.cli.summary import GROUND, Panel, make_sheet, panel_side
-from oasis_warp.core.camera import orbit_camera
 from oasis_warp.data.json_text import read_json
 from oasis_warp.data.pictures import PICTURE_SUFFIXES, check_suffix, to_uint8, write_picture
 from oasis_warp.hand_avatar import Avatar
@@ -92,8 +91,7 @@ def draw_comparison(one: Avatar, other: Avatar, names: list[str]) -> tuple[torch
         drawn = []
         for avatar in (one, other):
             held = avatar.source_pose if pose == "photo" else avatar.held(pose)
-            camera = orbit_camera(avatar.mesh(held).vertices, azimuth, 0.0, side)
-            drawn.append(avatar.render(camera, held, GROUND).image)
+            drawn.append(avatar.render(avatar.orbit_camera(held, azimuth, size=side), held, GROUND).image)
         error = float((drawn[0] - drawn[1]).square().mean())
         likeness.append(-10 * math.log10(error) if error else math.inf)
         apart = 0.5 + MAGNIFIED * (drawn[1] - drawn[0]) / 2

@@ -13,7 +13,7 @@ from oasis_warp.cli.progress import EDIT_PLAN, Run, Terminal, check_device, plai
 from oasis_warp.cli.record import exact_command, written
 from oasis_warp.cli.report import measures_table, print_warnings, to_json
 from oasis_warp.cli.summary import GROUND, WIDTH, Panel, make_sheet, panel_side
-from oasis_warp.core.camera import crop_camera, orbit_camera
+from oasis_warp.core.camera import crop_camera
 from oasis_warp.core.config import EditConfig, check_config
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import timed_stage
@@ -130,14 +130,13 @@ def draw_edit(before: Avatar, made: Edit, title: str) -> torch.Tensor:
         Panel(draw(after, camera, pose), "after"),
     ]
     side = panel_side(2 + len(POSES), WIDTH)
-    around = after.mesh(pose).vertices
-    views = [(angle, pose, around) for angle in (ANGLE, -ANGLE)]
     second = [
-        Panel(draw(after, orbit_camera(v, angle, 0.0, side), p), f"{math.degrees(angle):.0f}°") for angle, p, v in views
+        Panel(draw(after, after.orbit_camera(pose, angle, size=side), pose), f"{math.degrees(angle):.0f}°")
+        for angle in (ANGLE, -ANGLE)
     ]
     for name in POSES:
         held = after.held(name)
-        second.append(Panel(draw(after, orbit_camera(after.mesh(held).vertices, 0.0, 0.0, side), held), name))
+        second.append(Panel(draw(after, after.orbit_camera(held, 0.0, size=side), held), name))
     measures = made.measures
     words = [MEASURES[name][1].format(measures[name]) for name in ("painted_mm2", "input_psnr_db")]
     words.append(f"{measures['new_gaussians']:.0f} new Gaussians")

@@ -19,7 +19,7 @@ OutputFolder = Annotated[Path, arg(aliases=["-o"], metavar="PATH", help="Folder 
 AvatarFile = Positional[Annotated[Path, arg(metavar="AVATAR", help="avatar.safetensors of `oasis reconstruct`.")]]
 JsonFile = Annotated[Path | None, arg(help="JSON file to write the numbers to.")]
 Device = Annotated[Literal["cpu", "cuda"], arg(help="Device that computes.")]
-Elevation = Annotated[float, arg(help="Degrees of the camera above the hand.")]
+Elevation = Annotated[float, arg(help="Degrees of the camera above the hand, towards its fingers.")]
 Light = Annotated[
     Literal["photo", "even", "studio"] | Path,
     arg(help="Light: the photo's, even, a studio's, or an environment map (FILE.hdr)."),
@@ -131,7 +131,7 @@ class Render:
     pose: PoseName | Path = "photo"
     """Pose of the hand; "photo" is the pose in the photo. A file works too, as for --motion of `oasis animate`."""
     azimuth: float = 0.0
-    """Degrees of the camera around the hand; 0 is the photo's side."""
+    """Degrees of the camera around the hand and its arm; 0 is the photo's side."""
     elevation: Elevation = 0.0
     size: int = 512
     """Side of the picture [px]."""

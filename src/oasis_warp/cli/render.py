@@ -11,7 +11,6 @@ from oasis_warp.avatar.sky import environment_light, studio_light
 from oasis_warp.cli.options import Animate, Render
 from oasis_warp.cli.progress import check_device
 from oasis_warp.cli.record import written
-from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.config import BLACK, WHITE
 from oasis_warp.core.errors import InputError, did_you_mean
 from oasis_warp.core.processes import single_threaded_math
@@ -108,9 +107,7 @@ def run(options: Render) -> int:
     background = BLACK if transparent else read_color(options.background)
     avatar = load_avatar(options, options.avatar)
     pose = choose_pose(avatar, options.pose)
-    camera = orbit_camera(
-        avatar.mesh(pose).vertices, math.radians(options.azimuth), math.radians(options.elevation), options.size
-    )
+    camera = avatar.orbit_camera(pose, math.radians(options.azimuth), math.radians(options.elevation), options.size)
     drawn = avatar.render(camera, pose, background)
     write_picture(options.out, to_uint8(straight_alpha(drawn) if transparent else drawn.image))
     written(options.out)

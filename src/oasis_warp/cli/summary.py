@@ -126,11 +126,9 @@ def draw_summary(
         return picture
 
     first = fits[0]
-    side, around = panel_side(VIEWS, WIDTH), avatar.mesh(first.pose).vertices
-    views = [
-        Panel(draw(orbit_camera(around, 2 * math.pi * k / VIEWS, 0.0, side), first.pose), f"{360 * k // VIEWS}°")
-        for k in range(VIEWS)
-    ]
+    side = panel_side(VIEWS, WIDTH)
+    cameras = [avatar.orbit_camera(first.pose, 2 * math.pi * k / VIEWS, size=side) for k in range(VIEWS)]
+    views = [Panel(draw(camera, first.pose), f"{360 * k // VIEWS}°") for k, camera in enumerate(cameras)]
     held = {name: avatar.held(name) for name in POSES}
     # All poses share one camera, so that they can be compared.
     reach = torch.cat([avatar.mesh(pose).vertices for pose in held.values()])

@@ -13,7 +13,7 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 from oasis_warp.avatar.appearance import label_regions
 from oasis_warp.avatar.observation import facing, inner_mask, observe
 from oasis_warp.avatar.wrist import ARM_GROWTH, ARM_LENGTH, rim_axis
-from oasis_warp.core.camera import camera_center, crop_camera, orbit_camera, project
+from oasis_warp.core.camera import camera_center, crop_camera, project
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.surface import face_normals
 from oasis_warp.core.types import Camera, HandCrop, HandPose, Render
@@ -86,9 +86,8 @@ def views_of(avatar: Avatar) -> list[View]:
 
 def frame(avatar: Avatar, pose: HandPose, degrees: float) -> Camera:
     """A camera from the side `degrees` that frames the posed hand as `crop_hand` frames a photo's."""
-    vertices = avatar.mesh(pose).vertices
-    camera = orbit_camera(vertices, math.radians(degrees), size=DRAWN_SIZE)
-    xy, _ = project(camera, vertices)
+    camera = avatar.orbit_camera(pose, math.radians(degrees), size=DRAWN_SIZE)
+    xy, _ = project(camera, avatar.mesh(pose).vertices)
     low, high = xy.amin(0), xy.amax(0)
     side = CROP_MARGIN * float((high - low).max())
     left, top = ((low + high - side) / 2).tolist()
