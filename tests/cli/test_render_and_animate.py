@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 import torch
 from synthetic import as_left_hand
+from torch.nn.functional import normalize
 
+from oasis_warp.avatar.wrist import hand_up
 from oasis_warp.cli import main
 from oasis_warp.cli.animate import around, draw_frames, still_camera, turntable
 from oasis_warp.core import rotation
@@ -73,8 +75,12 @@ def test_a_turntable_turns_once_and_starts_at_the_photo(scene):
     frames = list(turntable(avatar, avatar.source_pose, 4, 64, **LOOK))
     camera = orbit_camera(avatar.mesh(avatar.source_pose).vertices, 0.0, 0.0, 64)
     assert torch.equal(frames[0], to_uint8(avatar.render(camera, avatar.source_pose).image))
-    # From behind, a hand's outline is the mirror image, but for perspective.
-    front, back = ((frame < 250).any(-1) for frame in (frames[0], frames[2].flip(1)))
+    # From behind, a hand's outline is the image mirrored at its arm, but for perspective.
+    x, y = normalize(hand_up(avatar.hand, avatar.mesh(avatar.source_pose).vertices)[:2], dim=0).tolist()
+    across = np.array([[2 * x * x - 1, 2 * x * y], [2 * x * y, 2 * y * y - 1]])
+    mirror = np.column_stack([across, 31.5 - across @ [31.5, 31.5]])
+    back = cv2.warpAffine(frames[2].numpy(), mirror, (64, 64), borderValue=(255, 255, 255))
+    front, back = ((frame < 250).any(-1) for frame in (frames[0].numpy(), back))
     assert (front & back).sum() / (front | back).sum() > 0.8
     assert len({frame.numpy().tobytes() for frame in frames}) == 4
 

@@ -147,14 +147,6 @@ def rim_axis(rest: Float[Tensor, "V 3"], rim: Int[Tensor, "R"]) -> Float[Tensor,
     return axis * torch.sign((axis * (middle - rest.mean(0))).sum())
 
 
-def hand_up(hand: HandModel, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "3"]:
-    """Direction from the arm to the hand, for posed `vertices`: an orbit around it sees the hand from all sides.
-
-    Around the picture's vertical, a hand that points to the side would also be seen along its arm.
-    """
-    return -rim_axis(vertices, hand.rim.to(vertices.device))
-
-
 def arm_axis(rest: Float[Tensor, "V 3"], rim: Int[Tensor, "R"]) -> Float[Tensor, "3"]:
     """Direction in which the arm goes on: half way from the rim's normal to the direction of the skin before it.
 
@@ -163,6 +155,14 @@ def arm_axis(rest: Float[Tensor, "V 3"], rim: Int[Tensor, "R"]) -> Float[Tensor,
     """
     axis = rim_axis(rest, rim)
     return normalize(axis + _slopes(rest, rim, axis).mean(0), dim=0)
+
+
+def hand_up(hand: HandModel, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "3"]:
+    """Direction from the arm to the hand, for posed `vertices`: an orbit around it sees the hand from all sides.
+
+    Around the picture's vertical, a hand that points to the side would also be seen along its arm.
+    """
+    return -arm_axis(vertices, hand.rim.to(vertices.device))
 
 
 def _slopes(rest: Tensor, rim: Tensor, axis: Tensor) -> Float[Tensor, "R 3"]:

@@ -63,10 +63,10 @@ def orbit_camera(
     center = (vertices.amin(0) + vertices.amax(0)) / 2
     radius = (vertices - center).norm(dim=-1).amax()
     ca, sa, ce, se = math.cos(azimuth), math.sin(azimuth), math.cos(elevation), math.sin(elevation)
-    pan = torch.tensor([[ca, 0, sa], [0, 1, 0], [-sa, 0, ca]], dtype=vertices.dtype)
-    tilt = torch.tensor([[1, 0, 0], [0, ce, se], [0, -se, ce]], dtype=vertices.dtype)
-    roll = _roll_to(up).to(vertices.dtype)
-    axes = (roll @ pan @ tilt @ roll.T).to(vertices.device)  # columns: the camera's x, y, z in the world
+    pan = torch.tensor([[ca, 0, sa], [0, 1, 0], [-sa, 0, ca]], dtype=torch.float64)
+    tilt = torch.tensor([[1, 0, 0], [0, ce, se], [0, -se, ce]], dtype=torch.float64)
+    roll = _roll_to(up)
+    axes = (roll @ pan @ tilt @ roll.T).to(vertices)  # columns: the camera's x, y, z in the world
     position = center - axes[:, 2] * radius * (ORBIT_MARGIN / math.sin(ORBIT_FIELD_OF_VIEW / 2))
     viewmat = torch.eye(4, dtype=vertices.dtype, device=vertices.device)
     viewmat[:3, :3] = axes.T
@@ -81,6 +81,6 @@ def _roll_to(up: Float[Tensor, "3"] | None) -> Float[Tensor, "3 3"]:
     x, y, z = (0.0, -1.0, 0.0) if up is None else up.tolist()
     in_picture = math.hypot(x, y)
     if in_picture <= LEAST_IN_PICTURE * math.hypot(x, y, z):
-        return torch.eye(3)
+        return torch.eye(3, dtype=torch.float64)
     c, s = -y / in_picture, x / in_picture
-    return torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    return torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float64)
