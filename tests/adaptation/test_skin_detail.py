@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from oasis_warp.adaptation.skin_detail import flush_shade, relief, sample_detail
+from oasis_warp.adaptation.skin_detail import flush_shade, joint_shade, relief, sample_detail
 from oasis_warp.adaptation.skin_grain import CELL, skin_grain
 from oasis_warp.adaptation.unseen_skin import _skin_detail
 from oasis_warp.avatar.appearance import label_regions, skin_regions
@@ -56,6 +56,21 @@ def test_no_finger_is_redder_than_another():
         blood = flush_shade(hand, seed)[:, 1]
         means = torch.stack([blood[palm & (finger == k)].mean() for k in range(1, 6)])
         assert float(means.max() - means.min()) < 0.015
+
+
+def test_joints_and_fingertips_are_darker_and_redder_than_the_bones_between_them(hand):
+    """Backs of painted fingers had one colour; a photo's have dark red joints and tips."""
+    shade = joint_shade(hand)
+    palm = label_regions(hand).palm
+    assert float(shade[palm > 0.999].mean()) > -0.001 and float(shade.max()) <= 0
+    finger = finger_of(hand.segment) == finger_of(MIDDLE)
+    on_bone = {at: finger & (hand.segment == MIDDLE + at) & (palm < 0.05) for at in range(3)}
+    between = shade[on_bone[1] & ((hand.bone_t - 0.55).abs() < 0.1)].mean(0)
+    for joint in (shade[on_bone[at] & (hand.bone_t < 0.1)].mean(0) for at in (1, 2)):
+        assert float((joint - between).mean()) < -0.012
+        assert float(joint[0] - joint[1]) > float(between[0] - between[1]) + 0.01
+    tip = shade[on_bone[2] & (hand.bone_t > 0.6)].mean(0)
+    assert float(tip[0] - tip[1]) > 0.03
 
 
 def test_nails_are_where_the_hand_model_has_them(hand):

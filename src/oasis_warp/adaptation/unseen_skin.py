@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 from oasis_warp.adaptation.fine_skin import SPACING
 from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.adaptation.reliability import VertexObservations
-from oasis_warp.adaptation.skin_detail import SkinDetail, flush_shade, relief_shade, sample_detail
+from oasis_warp.adaptation.skin_detail import SkinDetail, flush_shade, joint_shade, relief_shade, sample_detail
 from oasis_warp.adaptation.skin_grain import skin_grain
 from oasis_warp.adaptation.skin_tone import MIN_COLOR, SkinTone, infer_tone
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
@@ -95,9 +95,9 @@ def paint_unseen(
 
     A painted place is exp(t + x + d). The mean colour t is that of the region in the person's tone (`infer_tone`). The
     membrane x continues the difference of the seen skin from it (`inpaint`). The detail d comes from real hands
-    (`sample_detail`), with the skin's relief (`relief_shade`), blotches of blood (`flush_shade`) and grain
-    (`skin_grain`). Where the seen skin ends, t + x is its own smooth colour, so that gradients continue and no seam
-    shows. Seen skin gets grain, which its shade removes in the photo.
+    (`sample_detail`), with the skin's relief (`relief_shade`), blotches of blood (`flush_shade`), red joints
+    (`joint_shade`) and grain (`skin_grain`). Where the seen skin ends, t + x is its own smooth colour, so that
+    gradients continue and no seam shows. Seen skin gets grain, which its shade removes in the photo.
 
     Args:
         hand: Model of the surface.
@@ -155,7 +155,7 @@ def paint_hand(
 def _skin_form(hand: HandModel, rest: Float[Tensor, "V 3"], seed: int) -> Float[Tensor, "V 3"]:
     """What relief and blood add to the logarithms of bare skin."""
     bare = 1 - skin_regions(hand).nail.to(rest)
-    return (relief_shade(hand, seed) + flush_shade(hand, seed)).to(rest) * bare[:, None]
+    return (relief_shade(hand, seed) + flush_shade(hand, seed) + joint_shade(hand)).to(rest) * bare[:, None]
 
 
 def _paint_on(
