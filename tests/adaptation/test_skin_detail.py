@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from oasis_warp.adaptation.skin_detail import flush_shade, joint_shade, relief, sample_detail
+from oasis_warp.adaptation.skin_detail import flush_shade, joint_shade, relief, relief_shade, sample_detail
 from oasis_warp.adaptation.skin_grain import CELL, skin_grain
 from oasis_warp.adaptation.unseen_skin import _skin_detail
 from oasis_warp.avatar.appearance import label_regions, skin_regions
@@ -62,15 +62,25 @@ def test_joints_and_fingertips_are_darker_and_redder_than_the_bones_between_them
     """Backs of painted fingers had one colour; a photo's have dark red joints and tips."""
     shade = joint_shade(hand)
     palm = label_regions(hand).palm
-    assert float(shade[palm > 0.999].mean()) > -0.001 and float(shade.max()) <= 0
+    assert float(shade[(palm > 0.999) & (hand.segment == 0)].min()) > -0.01 and float(shade.max()) <= 0
     finger = finger_of(hand.segment) == finger_of(MIDDLE)
     on_bone = {at: finger & (hand.segment == MIDDLE + at) & (palm < 0.05) for at in range(3)}
     between = shade[on_bone[1] & ((hand.bone_t - 0.55).abs() < 0.1)].mean(0)
     for joint in (shade[on_bone[at] & (hand.bone_t < 0.1)].mean(0) for at in (1, 2)):
         assert float((joint - between).mean()) < -0.012
         assert float(joint[0] - joint[1]) > float(between[0] - between[1]) + 0.01
-    tip = shade[on_bone[2] & (hand.bone_t > 0.6)].mean(0)
-    assert float(tip[0] - tip[1]) > 0.03
+    for side in (palm < 0.05, palm > 0.95):
+        tip = shade[finger & (hand.segment == MIDDLE + 2) & side & (hand.bone_t > 0.6)].mean(0)
+        assert float(tip[0] - tip[1]) > 0.03
+
+
+def test_pads_of_fingers_are_as_bright_as_their_joints(hand):
+    """Relief made pads pale between dark bands."""
+    shade = relief_shade(hand, 0).mean(1)
+    pads = (hand.segment == MIDDLE + 1) & (label_regions(hand).palm > 0.99)
+    assert 0.01 < float(shade[pads].max() - shade[pads].min()) < 0.1
+    palm = (hand.segment == 0) & (label_regions(hand).palm > 0.99)
+    assert float(shade[palm].max() - shade[palm].min()) > 0.2
 
 
 def test_nails_are_where_the_hand_model_has_them(hand):
