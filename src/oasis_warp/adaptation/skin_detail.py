@@ -162,6 +162,8 @@ times as much as now)."""
 MOST, DEEPEST = 0.7, 0.35
 """Height above and depth below the skin around to which forms are clamped [mm]: creases of palms are lines of the maps
 besides, and deeper hollows between knuckles looked like bruises."""
+HIGHEST = 0.35
+"""Height that forms of palms tend to [mm]: the ball of the thumb had a white patch."""
 BONY, TENDONS = (0.3, 0.9), (0.05, 0.45)
 """Range of how bony people are and how their tendons show; those of the synthetic world have .1 to .9 and .2 to 1."""
 THUMB_BASE = 13
@@ -182,9 +184,10 @@ def relief_shade(hand: HandModel, seed: int) -> Float[Tensor, "V 3"]:
     """What that adds to the logarithms of colours."""
     heights, palm = relief(hand, seed)[:, None], skin_regions(hand).palm.cpu()[:, None]
     wide = surface.smooth_over_mesh(heights, surface.mesh_edges(hand.faces.cpu()), WIDE_PASSES)
-    heights = heights + WIDE * (1 - palm) * wide
-    on_palm = heights.new_tensor(PALM_PER_MM) * (1 + (ON_PADS - 1) * _finger_share(hand))
-    return heights * torch.lerp(heights.new_tensor(PER_MM).expand_as(on_palm), on_palm, palm)
+    on_back = heights.new_tensor(PER_MM) * (heights + WIDE * wide)
+    on_palm = torch.where(heights > 0, HIGHEST * torch.tanh(heights / HIGHEST), heights)
+    on_palm = heights.new_tensor(PALM_PER_MM) * (1 + (ON_PADS - 1) * _finger_share(hand)) * on_palm
+    return torch.lerp(on_back, on_palm, palm)
 
 
 def _finger_share(hand: HandModel) -> Float[Tensor, "V 1"]:
