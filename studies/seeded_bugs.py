@@ -148,7 +148,7 @@ PIPELINE = [
     _of("cli/render", "cli/test_render_and_animate", "film_in_even_light", "--light even ignored",
         'options.light == "even"', 'options.light == "none"'),
     _of("core/camera", "core/test_camera", "horizon", "azimuth and elevation exchanged",
-        "(pan @ tilt)", "(tilt @ pan)"),
+        "roll @ pan @ tilt", "roll @ tilt @ pan"),
     _of("estimation/fit_quality", "estimation/test_fit", "reaches_a_border", "the right border not looked at",
         "hand[:, 0], hand[:, -1])", "hand[:, 0])"),
     _of("estimation/hand_crop", "data_stage/test_square_crop", "mirrored_photo or wrist_line",
