@@ -6,6 +6,7 @@ from synthetic import PALM_TO_CAMERA, as_left_hand, avatar_of, crop_of
 
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.pose import pose_gaussians
+from oasis_warp.avatar.wrist import hand_up
 from oasis_warp.core import rotation
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.mirror import mirror_points
@@ -58,6 +59,26 @@ def test_a_pose_may_be_given_by_its_name(left, as_shipped):
             call("fits")
         with pytest.raises(TypeError, match=r"^pose: expected a HandPose or a pose's name, got tuple\.$"):
             call(tuple(fist))
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+@pytest.mark.parametrize("turn", [0.0, 1.5, 3.0])
+def test_an_orbit_shows_no_hand_along_its_arm(side, turn, left, right):
+    """A hand that points to the side was a stump of arm from 270 degrees."""
+    avatar = {"left": left, "right": right}[side]
+    source = avatar.source_pose
+    roll = rotation.from_axis_angle(torch.tensor([0.0, 0.0, 1.0]), torch.tensor(turn))
+    pose = source._replace(orientation=roll @ source.orientation)
+    arm = -hand_up(avatar.hand, avatar.mesh(pose).vertices)
+    for azimuth in (0.0, 1.6, 3.1, 4.7):
+        view = avatar.orbit_camera(pose, azimuth).viewmat
+        assert float((view[2, :3] @ arm).abs()) < 0.4
+
+
+def test_an_orbit_is_around_one_pose(left):
+    many = HandPose(*(torch.stack([part, part]) for part in left.held("fist")))
+    with pytest.raises(ValueError, match=r"^pose\.angles: expected shape \[15, 3\], got .* One pose a camera\.$"):
+        left.orbit_camera(many, 0.0)
 
 
 @pytest.mark.parametrize("side", ["left", "right"])

@@ -241,12 +241,15 @@ class Avatar:
 
     @torch.no_grad()
     def orbit_camera(self, pose: HandPose | str, azimuth: float, elevation: float = 0.0, size: int = 256) -> Camera:
-        """A camera that frames the hand in `pose`, as `core.camera.orbit_camera` does; it moves around the arm.
+        """A camera that frames the hand in one `pose`, as `core.camera.orbit_camera` does; it moves around the arm.
 
         Raises:
-            TypeError, ValueError: `pose` is none, as in `mesh`.
+            TypeError: `pose` is neither a pose nor a name.
+            ValueError: a part of the pose has another shape or is not finite, or no pose has that name.
         """
-        vertices = self.mesh(pose).vertices
+        pose = self._checked(pose, validate=True)
+        check_shape("pose.angles", pose.angles, 15, 3, hint="One pose a camera.")
+        vertices = self.mesh(pose, validate=False).vertices
         return orbit_camera(vertices, azimuth, elevation, size, up=hand_up(self.hand, vertices))
 
     @torch.no_grad()

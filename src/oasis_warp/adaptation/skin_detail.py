@@ -242,7 +242,7 @@ JOINT_PASSES = 4
 def joint_shade(hand: HandModel) -> Float[Tensor, "V 3"]:
     """What blood over the joints of backs and in fingertips adds to the logarithms of colours; on the CPU.
 
-    Red and dark, where the maps of `sample_detail` have only what is fine.
+    It comes on top of the blood of `skin_tone`; the maps of `sample_detail` have only what is fine.
     """
     template, bone_t, segment = hand.template.cpu(), hand.bone_t.cpu(), hand.segment.cpu()
     back = 1 - skin_regions(hand).palm.cpu()
