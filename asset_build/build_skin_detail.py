@@ -18,18 +18,8 @@ import torch
 from scipy.sparse.linalg import splu
 
 from oasis_warp.adaptation.inpainting import laplacian_and_mass
-from oasis_warp.adaptation.skin_detail import (
-    BODY,
-    BOX,
-    FINER,
-    FORM_UNIT,
-    GREY,
-    LOUDEST_LINE,
-    LOW,
-    NO_LINE,
-    SPAN,
-    UNIT,
-)
+from oasis_warp.adaptation.skin_detail import BOX, FINER, GREY, LOUDEST_LINE, NO_LINE, UNIT, texels_of
+from oasis_warp.adaptation.skin_forms import FORM_UNIT
 from oasis_warp.avatar.appearance import label_regions
 from oasis_warp.avatar.wrist import shade_left
 from oasis_warp.core.hand_model import HandModel
@@ -113,7 +103,8 @@ def main(folder: Path) -> None:
     """Read the crops, write the maps beside the other assets."""
     target = Path(__file__).parents[1] / "src/oasis_warp/assets/skin"
     hand = bundled_hand()
-    faces, places = rasterize(texel_corners(hand), BOX[3], BOX[2])
+    corners = texels_of(hand.to(dtype=torch.float64)).numpy()[hand.uv_faces.numpy()]
+    faces, places = rasterize(corners, BOX[3], BOX[2])
     details = []
     for name, gain in HANDS.items():
         bgr = cv2.imread(str(folder / f"{name}.png"))
@@ -127,7 +118,7 @@ def main(folder: Path) -> None:
     for k, detail in enumerate(details):
         stored = np.rint(GREY + UNIT * LOUDEST * np.tanh(detail / LOUDEST)).clip(0, 255).astype(np.uint8)
         write(target / f"detail_{k}.png", spread_out(stored, faces >= 0))
-    faces, places = rasterize(FINER * texel_corners(hand), FINER * BOX[3], FINER * BOX[2])
+    faces, places = rasterize(FINER * corners, FINER * BOX[3], FINER * BOX[2])
     write(target / "nails.png", spread_out(nails(hand, faces, places), faces >= 0))
     write(target / "lines.png", spread_out(lines(hand, faces, places), faces >= 0, fill=NO_LINE))
     write_relief(hand, target / "relief.npz")
@@ -161,13 +152,6 @@ def write(path: Path, rgb: np.ndarray) -> None:
     """A PNG, as small as it gets."""
     cv2.imwrite(str(path), rgb[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
     print(path.name, path.stat().st_size)
-
-
-def texel_corners(hand: HandModel) -> np.ndarray:
-    """Column and row of the corners of each face in the crops, [F, 3, 2]; the first pixel's centre is at .5."""
-    atlas = np.array(LOW) + (hand.uv.double().numpy() - 0.01) / 0.98 * SPAN
-    place = np.stack([atlas[:, 0] * BODY - BOX[0], (1 - atlas[:, 1]) * BODY - BOX[1]], 1)
-    return place[hand.uv_faces.numpy()]
 
 
 def rasterize(corners: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:

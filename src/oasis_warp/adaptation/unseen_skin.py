@@ -10,7 +10,8 @@ from torch.nn.functional import normalize
 from oasis_warp.adaptation.fine_skin import SPACING
 from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.adaptation.reliability import VertexObservations
-from oasis_warp.adaptation.skin_detail import SkinDetail, flush_shade, joint_shade, relief_shade, sample_detail
+from oasis_warp.adaptation.skin_detail import SkinDetail, sample_detail
+from oasis_warp.adaptation.skin_forms import flush_shade, joint_shade, relief_shade
 from oasis_warp.adaptation.skin_grain import skin_grain
 from oasis_warp.adaptation.skin_tone import MIN_COLOR, SkinTone, infer_tone
 from oasis_warp.avatar.anchors import vertex_colors, vertex_to_gaussians
