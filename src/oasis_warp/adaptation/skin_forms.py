@@ -55,21 +55,20 @@ def relief(hand: HandModel, seed: int) -> Float[Tensor, "V"]:
     return heights.clamp(-DEEPEST, MOST)
 
 
+@functools.lru_cache(2)
+@torch.inference_mode(False)
+@torch.no_grad()
 def relief_shade(hand: HandModel, seed: int) -> Float[Tensor, "V 3"]:
-    """What that adds to the logarithms of colours."""
+    """What that adds to the logarithms of colours; on the CPU, not to be written to."""
     heights, palm = relief(hand, seed)[:, None], skin_regions(hand).palm.cpu()[:, None]
-    wide = surface.smooth_over_mesh(heights, surface.mesh_edges(hand.faces.cpu()), WIDE_PASSES)
+    segment, edges = hand.segment.cpu(), surface.mesh_edges(hand.faces.cpu())
+    wide = surface.smooth_over_mesh(heights, edges, WIDE_PASSES)
     on_back = heights.new_tensor(PER_MM) * (heights + WIDE * wide)
     on_palm = torch.where(heights > 0, HIGHEST * torch.tanh(heights / HIGHEST), heights)
-    on_palm = heights.new_tensor(PALM_PER_MM) * (1 + (ON_PADS - 1) * _finger_share(hand)) * on_palm
+    fingers = ((segment > 0) & (segment != THUMB_BASE)).to(heights)[:, None]
+    fingers = surface.smooth_over_mesh(fingers, edges, FINGER_PASSES)
+    on_palm = heights.new_tensor(PALM_PER_MM) * (1 + (ON_PADS - 1) * fingers) * on_palm
     return torch.lerp(on_back, on_palm, palm)
-
-
-def _finger_share(hand: HandModel) -> Float[Tensor, "V 1"]:
-    """1 on fingers, 0 on the palm and the ball of the thumb; on the CPU."""
-    segment = hand.segment.cpu()
-    bones = ((segment > 0) & (segment != THUMB_BASE)).to(hand.template.dtype)[:, None]
-    return surface.smooth_over_mesh(bones, surface.mesh_edges(hand.faces.cpu()), FINGER_PASSES)
 
 
 FLUSH, FLUSH_ON_BACK = (-0.018, -0.042, -0.041), 0.3
@@ -102,8 +101,9 @@ OVER_JOINTS = ((-0.075, -0.095, -0.095), 0.007), ((-0.05, -0.075, -0.075), 0.007
 """What the first, second and third joint of a finger add to the logarithms of the colours of its back, and the standard
 deviation of that spot [m]. On 7 photos of tests/data/photos and its same_hand, backs have, against the back of the
 metacarpus, logarithms of -.13 over the second joints, -.12 over the third and -.1 around nails, and redness log(R / G)
-of .06, .09 and .08. With this, painted hands have -.07, -.06 and -.07, and .06, .06 and .06; without, -.03, -.04 and
--.03, and .04, .04 and .01. First joints are dark instead of bright, as the relief of their heads makes them."""
+of .06, .09 and .08 (by a script that is not kept, as all such numbers here). With this, painted hands have -.07, -.06
+and -.07, and .06, .06 and .06; without, -.03, -.04 and -.03, and .04, .04 and .01. First joints were bright, by the
+relief of their heads, and are dark."""
 AT_TIP, TIP = (-0.005, -0.06, -0.045), (0.05, 0.5)
 """The same around nails and on the pads below them, and the part of the last bone over which it begins: 23 photos have
 pads of a redness log(R / G) of .06 there against the palm, painted pads had -.05."""
@@ -115,7 +115,7 @@ JOINT_PASSES = 4
 @torch.inference_mode(False)
 @torch.no_grad()
 def joint_shade(hand: HandModel) -> Float[Tensor, "V 3"]:
-    """What blood over the joints of backs and in fingertips adds to the logarithms of colours; on the CPU.
+    """What red joints and fingertips add to the logarithms of colours; on the CPU, not to be written to.
 
     It comes on top of the blood of `skin_tone`; the maps of `sample_detail` have only what is fine.
     """
