@@ -70,25 +70,35 @@ RIM = 3.0
 PEOPLE = (19, 43)
 """People of the synthetic world whose palm's lines are taken, and the first one's veins. The photos' own lines are
 blurred. Chosen by eye among 46 people, for long and soft lines."""
-FOLDS, FOLDS_OF_THUMB = {1: (6, 6.4, 1.5), 2: (3, 2.3, 1.1)}, {2: (5, 4.5, 0.7)}
+FOLDS, FOLDS_OF_THUMB = {1: (6, 5.2, 1.5), 2: (3, 2.3, 1.1)}, {2: (5, 4.5, 0.7)}
 """Number of folds over a finger's middle and end joint, how far from it they lie [mm], and their greatest strength. The
-thumb's middle joint has none: they looked like a scab there."""
+thumb's middle joint has none: they looked like a scab there. With 6.4 mm the outermost lay beyond the skin that
+`avatar.folds` opens, and stayed as brown spots on bent fingers."""
 FOLD_ANGLE, FOLD_BOW = 1.4, -1.6
 """Half of what the longest fold covers around the finger [rad], and how far the ends of the outermost ones bend back
 towards the joint [mm/rad^2]. With .95 folds were short strokes, like scratches."""
-PALM_LINES = {"crease": 2.2, "main": 1.8, "minor": 0.6, "wrinkle": 0.5}
-"""How dark lines of the palm are, in units of a clear fold. More and darker fine lines looked like a hairy rash to
-strangers."""
-RIDGE, PALM_RIDGE = 8.0, 5.0
-"""Blurs of folds and of the palm's lines that are taken off [finer texels of .3 mm]: skin beside them is a ridge, which
-catches light. Without, a joint was a brown patch, and creases were painted bands."""
+PALM_LINES = {"crease": 2.2, "main": 1.8, "minor": 1.3, "wrinkle": 0.9}
+"""How dark lines of the palm are, in units of a clear fold. Wrinkles of older people, too, were a dark patch on the
+ball of the thumb."""
+OLDER = (12, 26)
+"""Older people whose fine lines cross the palms of these two besides their own: with few, palms were smooth rubber
+between bold lines."""
+RIDGE = 8.0
+"""Blur of folds that is taken off [finer texels of .3 mm]: skin beside them is a ridge, which catches light. Without, a
+joint was a brown patch."""
+CORE, FLANK, FLANK_WIDTH = (1.6, 0.5), (0.1, 0.1), (6.0, 4.2)
+"""Shares of the palm's lines themselves and of the same blurred, and this blur [finer texels: .15 mm on palms, .3 mm on
+fingers], on palms and on the palm's side of fingers: skin rounds into a crease. On 10 photos of tests/data/photos and
+its same_hand a finger's crease, averaged along it at 256 px, is .08 deep in log(sRGB) at the middle joint, .09 at the
+end joint, and 3 to 4 mm wide. Lines between bright ridges were .10 and .14 deep and 1.5 mm wide, like drawn rings.
+Blurred as far as these means are, creases were painted bands: a real one is several thin lines."""
+HEEL, AT_HEEL = (-0.075, -0.025), 0.3
+"""Places along the hand [m] between which lines of the palm fade, and what is left of them at its heel: the line around
+the ball of the thumb was a slit in a fist."""
 BELOW_SKIN = 2.5
 """Blur of veins, which shine through the skin [finer texels]."""
 PAD_RIM = 3.0
 """Blur of the border between fingers and palm [texels]."""
-LINES_ON_PADS = 0.9
-"""How much of them stays on the palm's side of fingers. With .45, which suited Gaussians of 1 mm, creases
-looked like stains; Gaussians of .7 mm draw them sharply."""
 AROUND_PASSES = 20
 """Smoothings over the mesh that leave the skin around, some 10 mm: half of what a knuckle of 17 mm stands out stays."""
 NAIL_LENGTH = 1.0
@@ -129,15 +139,25 @@ def main(folder: Path) -> None:
 
 def lines(hand: HandModel, faces: np.ndarray, places: np.ndarray) -> np.ndarray:
     """The drawn lines of two persons and one person's veins, [H, W, 3]."""
-    drawn = [[draw(number) for number in PEOPLE] for draw in (knuckle_folds, lines_on_palm)]
-    folds, palms = (resampled(torch.stack(people, 1), faces, places) for people in drawn)
-    folds += palms - mean_around(folds, faces >= 0, RIDGE) - mean_around(palms, faces >= 0, PALM_RIDGE)
+    people = list(zip(PEOPLE, OLDER, strict=True))
+    drawn = [knuckle_folds(number) for number, _ in people], [lines_on_palm(*pair) for pair in people]
+    folds, palms = (resampled(torch.stack(values, 1), faces, places) for values in drawn)
+    folds -= mean_around(folds, faces >= 0, RIDGE)
+    pads, heel = finger_pads(hand, faces, places, FINER)[..., None], at_heel(hand, faces, places)[..., None]
+    palms *= 1 - (1 - pads) * (1 - AT_HEEL) * heel
+    for share, core, flank, width in zip((1 - pads, pads), CORE, FLANK, FLANK_WIDTH, strict=True):
+        folds += share * (core * palms + flank * mean_around(palms, faces >= 0, width))
     deep = mean_around(resampled(veins()[:, None], faces, places), faces >= 0, BELOW_SKIN)
     read = np.concatenate([folds, deep], 2)
-    read *= 1 - (1 - LINES_ON_PADS) * finger_pads(hand, faces, places, FINER)[..., None]
     before_wrist = shade_left(hand, hand.template)[:, 0]  # Gaussians stay coarse there, and thin lines would be dots
     read *= on_texels(before_wrist, hand, faces, places)[..., None]
     return np.rint(np.clip(NO_LINE + (255 - NO_LINE) / LOUDEST_LINE * read, 0, 255)).astype(np.uint8)
+
+
+def at_heel(hand: HandModel, faces: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """0 where the palm's lines are clear, 1 at its heel, [H, W]."""
+    begins, ends = HEEL
+    return on_texels(((hand.template[:, 0] - begins) / (ends - begins)).clamp(0, 1), hand, faces, places)
 
 
 def write_relief(hand: HandModel, path: Path) -> None:
@@ -259,8 +279,7 @@ def light_around_bones(hand: HandModel, colors: np.ndarray) -> np.ndarray:
 
 def veins() -> torch.Tensor:
     """The veins of one person of the synthetic world, at its texels; none on the palm."""
-    person = sample_identity(bundled_hand(), 0, PEOPLE[0], Population(hair=0))
-    return draw_lines(plan_skin(person).lines, texels_on("cpu").grid)["vein"] * (1 - palm_share())
+    return lines_of(PEOPLE[0])["vein"] * (1 - palm_share())
 
 
 def knuckle_folds(seed: int) -> torch.Tensor:
@@ -283,11 +302,17 @@ def knuckle_folds(seed: int) -> torch.Tensor:
     return draw_lines(strokes.lines(), texels_on("cpu").grid)["fold"] * (1 - palm_share())
 
 
-def lines_on_palm(number: int) -> torch.Tensor:
-    """How dark the lines of one person's palm are, at its texels; 0 on the back."""
+def lines_on_palm(number: int, older: int) -> torch.Tensor:
+    """How dark the lines of one person's palm are, with fine lines of an older one, at its texels; 0 on the back."""
+    own, other = (lines_of(person) for person in (number, older))
+    own["minor"] = torch.maximum(own["minor"], other["minor"])
+    return palm_share() * sum(gain * own[name] for name, gain in PALM_LINES.items())
+
+
+def lines_of(number: int) -> dict[str, torch.Tensor]:
+    """All lines of a person of the synthetic world, at its texels."""
     person = sample_identity(bundled_hand(), 0, number, Population(hair=0))
-    lines = draw_lines(plan_skin(person).lines, texels_on("cpu").grid)
-    return palm_share() * sum(gain * lines[name] for name, gain in PALM_LINES.items())
+    return draw_lines(plan_skin(person).lines, texels_on("cpu").grid)
 
 
 def palm_share() -> torch.Tensor:

@@ -75,7 +75,7 @@ def test_seen_skin_gets_grain_that_the_photo_does_not_show(hand, palm_photo, pai
     on = torch.cat([torch.zeros_like(made.vertex_index, dtype=torch.bool), seen[hand.faces[made.face_index]].all(1)])
     grain = skin_grain(hand, made, 0)[on]
     skin, photo = (g.colors[on].clamp_min(0.01).log().mean(1) for g in (made, with_shade_baked(made)))
-    assert int(on.sum()) > 20000 and 0.008 < float(grain.std()) < 0.025
+    assert int(on.sum()) > 20000 and 0.008 < float(grain.std()) < 0.035
     assert float(torch.corrcoef(torch.stack([grain, skin]))[0, 1]) > 0.1
     assert abs(float(torch.corrcoef(torch.stack([grain, photo]))[0, 1])) < 0.03
 
@@ -107,7 +107,7 @@ def test_a_photo_with_crisp_skin_gets_crisper_skin_painted(hand, palm_photo):
         made = paint(hand, palm_photo, observations=seen._replace(colors=seen.colors * (contrast * noise).exp()))
         where = unseen_back(hand, made)
         found.append(float(detail_of(hand, vertex_colors(made.gaussians, len(where)), where)))
-    assert found[1] > 1.45 * found[0]  # relief and blotches do not depend on it
+    assert found[1] > 1.4 * found[0]  # relief and blotches do not depend on it
 
 
 def test_the_photo_looks_as_before_in_its_own_view(hand, palm_photo, painted):

@@ -15,8 +15,8 @@ from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians
 
-ON_PALM = 0.5
-"""Share of it that palms have."""
+ON_PALM = 1.5
+"""How much of it palms have, over backs: their ridges and furrows. With .5 palms were smooth."""
 
 
 def skin_grain(hand: HandModel, gaussians: CanonicalGaussians, seed: int) -> Float[Tensor, "N"]:

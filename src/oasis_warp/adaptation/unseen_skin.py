@@ -33,8 +33,9 @@ MAX_DIFFERENT = 0.3
 """Difference of the logarithms from the person's mean colours that is carried on: more is dirt, a ring or a shadow."""
 SHOWS_FORM = 0.3
 """Cosine between normal and view from which a photo shows the forms of skin that it shows on a slant."""
-ON_PALM, ON_BACK = 1.6, 0.9
-"""Gain of the maps' detail on palms and on backs. With 1.25 on backs, which had fainter veins, skin looked mottled."""
+DETAIL = 0.9
+"""Gain of the maps' detail. With 1.25 on backs, which had fainter veins, skin looked mottled; with 1.6 on palms, which
+had less grain, it had swirls like watercolour."""
 LOUDEST_ON_PALM, LOUDEST_ON_BACK = 0.2, 0.12
 """Logarithms of sRGB that this detail tends to. The maps have the same contrast all over palms, not over backs."""
 LINES_ON_PALM, LINES_ON_BACK = 1.8, 2.6
@@ -224,7 +225,7 @@ def _skin_detail(detail: SkinDetail, palm: Float[Tensor, "N 1"] | float) -> Floa
     """What is added to the logarithms of smooth skin's colours; `palm` is its share."""
     folds = (LINES_ON_BACK + (LINES_ON_PALM - LINES_ON_BACK) * palm) * detail.fold[:, None]
     lines = folds * detail.skin.new_tensor(FOLD) + detail.vein[:, None] * detail.skin.new_tensor(VEIN)
-    own = (ON_BACK + (ON_PALM - ON_BACK) * palm) * detail.skin
+    own = DETAIL * detail.skin
     loudest = LOUDEST_ON_BACK + (LOUDEST_ON_PALM - LOUDEST_ON_BACK) * palm
     return loudest * torch.tanh(own / loudest) + lines
 

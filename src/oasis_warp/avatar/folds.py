@@ -22,8 +22,9 @@ from oasis_warp.core.types import CanonicalGaussians
 
 CLOSED, OPENED = math.radians(15), math.radians(75)
 """How much further a joint is bent than in that state, up to which folds stay and from which they are open [rad]."""
-REACH = 1.5
-"""Gain of the label of knuckles, clamped to 1: folds lie up to 8 mm beside a joint."""
+REACH = 3.0
+"""Gain of the label of knuckles, clamped to 1: folds lie up to 8 mm beside a joint. With 1.5 the outermost stayed as
+brown spots on bent fingers."""
 PASSES = 25
 """Smoothings over the mesh that carry the colours around a joint over it, about 10 mm."""
 STRETCHED = (0.10, 0.08, 0.06)
