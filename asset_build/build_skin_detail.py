@@ -77,7 +77,7 @@ thumb's middle joint has none: they looked like a scab there. With 6.4 mm the ou
 FOLD_ANGLE, FOLD_BOW = 1.4, -1.6
 """Half of what the longest fold covers around the finger [rad], and how far the ends of the outermost ones bend back
 towards the joint [mm/rad^2]. With .95 folds were short strokes, like scratches."""
-PALM_LINES = {"crease": 2.2, "main": 1.8, "minor": 1.3, "wrinkle": 0.9}
+PALM_LINES = {"crease": 2.2, "main": 1.4, "minor": 1.3, "wrinkle": 0.6}
 """How dark lines of the palm are, in units of a clear fold. Wrinkles of older people, too, were a dark patch on the
 ball of the thumb."""
 OLDER = (12, 26)

@@ -69,8 +69,9 @@ MIN_COLOR = 0.02
 """Colours are clamped to it before their logarithm is taken [sRGB]."""
 MIN_SHOWN = 1e-3
 """Least colour that comes out of colours and shade, which is a factor above 0."""
-MIN_LIGHT = 0.05
-"""Least light relative to the mean, because colours are divided by it."""
+MIN_LIGHT = 0.25
+"""Least light relative to the mean, because colours are divided by it. With .05 the palm of one hand in low light from
+one side was a dark patch beside a bright streak."""
 OUTLINE_MARGIN = 1 / 32
 """Width over which light is continued beyond the outline of the surface, over the side of the picture."""
 
