@@ -100,6 +100,17 @@ def facing_in(hand, crop):
     return posed_lighting(crop.rest.vertices, crop.posed.vertices, hand.faces, LIGHT).normals
 
 
+def test_light_from_one_side_leaves_no_black(hand, scene):
+    """In low light from one side, an opened palm was a dark patch beside a bright streak."""
+    even, truth, *_ = scene
+    strong = torch.tensor([0.5, 1.8, 0.0, -0.1])[:, None].expand(-1, 3)
+    hard = LIGHT._replace(harmonics=strong, limits=torch.tensor([[0.01] * 3, [3.0] * 3]))
+    on = with_photo(hard, even.rest.vertices, even.posed.vertices, hand.faces)
+    drawn = render(pose_gaussians(truth, hand.faces, even.rest.vertices, even.posed.vertices, on), even.camera)
+    found = fit_light(hand, even.image, even._replace(image=drawn.image + (1 - drawn.alpha)[..., None] * even.image))
+    assert float(found.limits[0].min()) >= 0.25
+
+
 def test_light_on_nothing_is_even(hand, scene):
     even, *_ = scene
     nothing = even._replace(mask=torch.zeros_like(even.mask))

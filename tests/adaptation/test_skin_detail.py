@@ -7,6 +7,7 @@ from oasis_warp.adaptation.skin_detail import sample_detail
 from oasis_warp.adaptation.skin_grain import CELL, skin_grain
 from oasis_warp.adaptation.unseen_skin import _skin_detail
 from oasis_warp.avatar.appearance import label_regions, skin_regions
+from oasis_warp.avatar.folds import _joint_skin
 from oasis_warp.core import surface
 from oasis_warp.core.types import CanonicalGaussians
 from oasis_warp.hand.template import bundled_hand
@@ -54,6 +55,31 @@ def test_folds_of_straight_fingers_are_no_darker_than_the_skin_around(hand):
         assert abs(float(fold[joint].mean())) < 0.04
         assert float(fold[joint].amin()) < -0.15
         assert float(fold[joint & (around < 0.7)].std()) > 0.02
+
+
+def test_folds_of_fingers_lie_in_skin_that_opens(hand):
+    """The outermost folds of middle joints lay beyond it and stayed as brown spots on bent fingers."""
+    faces, skin = torch.arange(len(hand.faces)), _joint_skin(hand)
+    share = torch.zeros(len(hand.template)).index_copy(0, skin.vertex, skin.fold)
+    opens, palm = (values[hand.faces].mean(1) for values in (share, skin_regions(hand).palm))
+    on_finger = torch.isin(hand.segment[hand.faces[:, 0]], torch.tensor([1, 2, 4, 5, 7, 8, 10, 11])) & (palm < 0.05)
+    for seed in range(2):
+        fold = sample_detail(hand, at_places(faces[:0], faces, torch.full((len(faces), 3), 1 / 3)), seed).fold
+        folded = on_finger & (fold > 0.3)
+        assert int(folded.sum()) > 50 and float(opens[folded].quantile(0.05)) > 0.8, seed
+
+
+def test_lines_of_the_palm_fade_towards_the_wrist(hand):
+    """The line around the ball of the thumb ended as a slit in the middle of a fist."""
+    faces = torch.arange(len(hand.faces))
+    middles, palm = hand.template[hand.faces].mean(1), skin_regions(hand).palm[hand.faces].mean(1)
+    for seed in range(2):
+        fold = sample_detail(hand, at_places(faces[:0], faces, torch.full((len(faces), 3), 1 / 3)), seed).fold
+        clear, faded = (
+            float(fold[(palm > 0.95) & (middles[:, 0] > low) & (middles[:, 0] < high)].quantile(0.99))
+            for low, high in ((-0.095, -0.07), (-0.045, -0.02))
+        )
+        assert clear > 0.6 and faded < 0.5 * clear, (seed, clear, faded)
 
 
 def test_the_same_place_has_the_same_detail_as_a_vertex_and_on_a_face(hand):
