@@ -78,20 +78,21 @@ FOLD_ANGLE, FOLD_BOW = 1.4, -1.6
 """Half of what the longest fold covers around the finger [rad], and how far the ends of the outermost ones bend back
 towards the joint [mm/rad^2]. With .95 folds were short strokes, like scratches."""
 PALM_LINES = {"crease": 2.2, "main": 1.4, "minor": 1.3, "wrinkle": 0.6}
-"""How dark lines of the palm are, in units of a clear fold. Wrinkles of older people, too, were a dark patch on the
-ball of the thumb."""
+"""How dark lines of the palm are, in units of a clear fold. With the wrinkles of older people as well, the ball of the
+thumb had a dark patch."""
 OLDER = (12, 26)
 """Older people whose fine lines cross the palms of these two besides their own: with few, palms were smooth rubber
 between bold lines."""
 RIDGE = 8.0
 """Blur of folds that is taken off [finer texels of .3 mm]: skin beside them is a ridge, which catches light. Without, a
 joint was a brown patch."""
-CORE, FLANK, FLANK_WIDTH = (1.6, 0.5), (0.1, 0.1), (6.0, 4.2)
-"""Shares of the palm's lines themselves and of the same blurred, and this blur [finer texels: .15 mm on palms, .3 mm on
-fingers], on palms and on the palm's side of fingers: skin rounds into a crease. On 10 photos of tests/data/photos and
-its same_hand a finger's crease, averaged along it at 256 px, is .08 deep in log(sRGB) at the middle joint, .09 at the
-end joint, and 3 to 4 mm wide. Lines between bright ridges were .10 and .14 deep and 1.5 mm wide, like drawn rings.
-Blurred as far as these means are, creases were painted bands: a real one is several thin lines."""
+CORE, FLANK, FLANK_WIDTH = (1.6, 0.5), 0.1, (6.0, 4.2)
+"""Gain of the palm's lines, gain of the same lines blurred, and this blur [finer texels: .15 mm on palms, .3 mm on
+fingers]; two values are those of palms and of the palm's side of fingers. Skin rounds into a crease. On 10 photos of
+tests/data/photos and its same_hand a finger's crease, averaged along it at 256 px, is .08 deep in log(sRGB) at the
+middle joint, .09 at the end joint, and 3 to 4 mm wide. Lines between bright ridges were .10 and .14 deep and 1.5 mm
+wide, like drawn rings. Blurred as far as these means are, creases were painted bands: a real one is several thin
+lines."""
 HEEL, AT_HEEL = (-0.075, -0.025), 0.3
 """Places along the hand [m] between which lines of the palm fade, and what is left of them at its heel: the line around
 the ball of the thumb was a slit in a fist."""
@@ -139,16 +140,15 @@ def main(folder: Path) -> None:
 
 def lines(hand: HandModel, faces: np.ndarray, places: np.ndarray) -> np.ndarray:
     """The drawn lines of two persons and one person's veins, [H, W, 3]."""
-    people = list(zip(PEOPLE, OLDER, strict=True))
-    drawn = [knuckle_folds(number) for number, _ in people], [lines_on_palm(*pair) for pair in people]
-    folds, palms = (resampled(torch.stack(values, 1), faces, places) for values in drawn)
-    folds -= mean_around(folds, faces >= 0, RIDGE)
+    drawn = map(knuckle_folds, PEOPLE), map(lines_on_palm, PEOPLE, OLDER)
+    folds, palms = (resampled(torch.stack(list(of_people), 1), faces, places) for of_people in drawn)
+    read = folds - mean_around(folds, faces >= 0, RIDGE)
     pads, heel = finger_pads(hand, faces, places, FINER)[..., None], at_heel(hand, faces, places)[..., None]
     palms *= 1 - (1 - pads) * (1 - AT_HEEL) * heel
-    for share, core, flank, width in zip((1 - pads, pads), CORE, FLANK, FLANK_WIDTH, strict=True):
-        folds += share * (core * palms + flank * mean_around(palms, faces >= 0, width))
+    for share, core, width in zip((1 - pads, pads), CORE, FLANK_WIDTH, strict=True):
+        read += share * (core * palms + FLANK * mean_around(palms, faces >= 0, width))
     deep = mean_around(resampled(veins()[:, None], faces, places), faces >= 0, BELOW_SKIN)
-    read = np.concatenate([folds, deep], 2)
+    read = np.concatenate([read, deep], 2)
     before_wrist = shade_left(hand, hand.template)[:, 0]  # Gaussians stay coarse there, and thin lines would be dots
     read *= on_texels(before_wrist, hand, faces, places)[..., None]
     return np.rint(np.clip(NO_LINE + (255 - NO_LINE) / LOUDEST_LINE * read, 0, 255)).astype(np.uint8)
@@ -304,7 +304,7 @@ def knuckle_folds(seed: int) -> torch.Tensor:
 
 def lines_on_palm(number: int, older: int) -> torch.Tensor:
     """How dark the lines of one person's palm are, with fine lines of an older one, at its texels; 0 on the back."""
-    own, other = (lines_of(person) for person in (number, older))
+    own, other = lines_of(number), lines_of(older)
     own["minor"] = torch.maximum(own["minor"], other["minor"])
     return palm_share() * sum(gain * own[name] for name, gain in PALM_LINES.items())
 

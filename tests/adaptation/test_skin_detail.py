@@ -22,6 +22,12 @@ def at_places(vertices, faces, barycentrics):
     )
 
 
+def on_all_faces(hand):
+    """A Gaussian in the middle of every face."""
+    faces = torch.arange(len(hand.faces))
+    return at_places(faces[:0], faces, torch.full(hand.faces.shape, 1 / 3))
+
+
 def test_nails_are_where_the_hand_model_has_them(hand):
     index = torch.arange(len(hand.template))
     detail = sample_detail(hand, at_places(index, index[:0], torch.zeros(0, 3)), 0)
@@ -43,9 +49,7 @@ def test_palm_lines_are_one_persons_and_take_turns_with_the_seed(hand):
 
 def test_folds_of_straight_fingers_are_no_darker_than_the_skin_around(hand):
     """Folds without ridges between them made a brown patch of a joint, and short ones were scratches."""
-    faces = torch.arange(len(hand.faces))
-    middle = torch.full((len(faces), 3), 1 / 3)
-    fold = sample_detail(hand, at_places(faces[:0], faces, middle), 0).fold
+    fold = sample_detail(hand, on_all_faces(hand), 0).fold
     segment = hand.segment[hand.faces[:, 0]]
     palm, along, around = (
         values[hand.faces].mean(1) for values in (skin_regions(hand).palm, hand.bone_t, hand.bone_theta.cos())
@@ -59,22 +63,21 @@ def test_folds_of_straight_fingers_are_no_darker_than_the_skin_around(hand):
 
 def test_folds_of_fingers_lie_in_skin_that_opens(hand):
     """The outermost folds of middle joints lay beyond it and stayed as brown spots on bent fingers."""
-    faces, skin = torch.arange(len(hand.faces)), _joint_skin(hand)
+    skin = _joint_skin(hand)
     share = torch.zeros(len(hand.template)).index_copy(0, skin.vertex, skin.fold)
     opens, palm = (values[hand.faces].mean(1) for values in (share, skin_regions(hand).palm))
     on_finger = torch.isin(hand.segment[hand.faces[:, 0]], torch.tensor([1, 2, 4, 5, 7, 8, 10, 11])) & (palm < 0.05)
     for seed in range(2):
-        fold = sample_detail(hand, at_places(faces[:0], faces, torch.full((len(faces), 3), 1 / 3)), seed).fold
+        fold = sample_detail(hand, on_all_faces(hand), seed).fold
         folded = on_finger & (fold > 0.3)
         assert int(folded.sum()) > 50 and float(opens[folded].quantile(0.05)) > 0.8, seed
 
 
 def test_lines_of_the_palm_fade_towards_the_wrist(hand):
     """The line around the ball of the thumb ended as a slit in the middle of a fist."""
-    faces = torch.arange(len(hand.faces))
     middles, palm = hand.template[hand.faces].mean(1), skin_regions(hand).palm[hand.faces].mean(1)
     for seed in range(2):
-        fold = sample_detail(hand, at_places(faces[:0], faces, torch.full((len(faces), 3), 1 / 3)), seed).fold
+        fold = sample_detail(hand, on_all_faces(hand), seed).fold
         clear, faded = (
             float(fold[(palm > 0.95) & (middles[:, 0] > low) & (middles[:, 0] < high)].quantile(0.99))
             for low, high in ((-0.095, -0.07), (-0.045, -0.02))
@@ -96,11 +99,9 @@ def test_no_finger_has_dark_bars_on_its_palm_side():
     """One of the maps' hands has dark skin, in whose creases pigment lies: to .75 of the skin around, on one finger."""
     hand = bundled_hand()
     palm = label_regions(hand).palm[hand.faces].mean(1)
-    faces, middle = torch.arange(len(hand.faces)), torch.full(hand.faces.shape, 1 / 3)
     bones = hand.segment[hand.faces[:, 0]]
     for seed in range(3):
-        detail = sample_detail(hand, at_places(faces[:0], faces, middle), seed)
-        added = _skin_detail(detail, palm[:, None]).mean(1)
+        added = _skin_detail(sample_detail(hand, on_all_faces(hand), seed), palm[:, None]).mean(1)
         darkest = [float(added[(bones == bone) & (palm > 0.7)].quantile(0.05)) for bone in range(1, 16)]
         assert -0.23 < min(darkest) < -0.05, seed  # thin creases have up to .21
 
