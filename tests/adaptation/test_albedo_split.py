@@ -120,6 +120,21 @@ def test_wide_folds_do_not_stay_where_the_hand_turns_into_the_arm(hand, albedo_s
     assert left(0.0) < 0.75 * left(1.0)
 
 
+def test_shade_leaves_no_line_where_what_the_photo_shows_ends(hand, albedo_scene):
+    """Skin on a slant was a dark patch with a hard edge, as what the photo did not show counted as lit."""
+    guess, _ = albedo_scene
+    seen = (hand.template[:, 0] < hand.template[:, 0].median()).float()
+    shown = vertex_to_gaussians(seen[:, None], hand.faces, guess)
+    learned = guess._replace(colors=guess.colors * (shown * torch.tensor([-0.25, -0.3, -0.35])).exp())
+
+    def left(weights):
+        parted = split_albedo_shading(hand, guess.colors, learned, seen=weights)
+        return (parted.colors / guess.colors).log().mean(1)[(shown[:, 0] == 1) & (learned.colors > 0.03).all(1)]
+
+    assert float(left(seen.clamp_min(0.02)).min()) == pytest.approx(-0.3 * ALBEDO_SHARE, abs=0.03)
+    assert float(left(None).min()) < -0.15
+
+
 def test_what_was_not_learned_does_not_change(hand, albedo_scene):
     guess, _ = albedo_scene
     parted = split_albedo_shading(hand, guess.colors, guess)

@@ -7,16 +7,19 @@ import numpy as np
 import pytest
 import torch
 from hand_build.quality import self_crossings
+from scipy.ndimage import binary_fill_holes
 from synthetic import avatar_of, crop_of
 
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.core import rotation, surface
+from oasis_warp.core.camera import orbit_camera
 from oasis_warp.core.mirror import mirror_points
 from oasis_warp.core.processes import using_threads
 from oasis_warp.core.types import HandPose, PosedHand
 from oasis_warp.hand.contact import CREVICE, LIMIT, resolve_contact
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
 from oasis_warp.hand.skinning import rest_hand, skin, skin_surface
+from oasis_warp.ops import depth_map
 
 
 def posed(hand, name, seed):
@@ -27,7 +30,7 @@ def posed(hand, name, seed):
 
 @pytest.fixture(scope="module")
 def fist(hand):
-    """Its fingers pass through each other and the palm: 1062 edges cross."""
+    """Its fingers pass through each other and the palm: 1073 edges cross."""
     return posed(hand, "fist", 105)
 
 
@@ -193,6 +196,21 @@ def test_fingers_of_a_fist_lie_as_close_as_on_the_mean_hand(hand, rests, mean_re
         expected = gap(hand, mean_rest, named_pose(hand, "fist"), *pair)
         made = [gap(hand, rest, named_pose(hand, "fist", rest), *pair) for rest in rests]
         assert median(made) < expected + 0.0005 and max(made) < expected + 0.002, pair
+
+
+def test_nothing_can_be_seen_through_a_fist(hand, rests, mean_rest):
+    """Fingers that were bent alike formed a tube: from a side, all of 32 fists showed what is behind."""
+    upright = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    away, size = torch.tensor([0, 0, 0.5]), 128
+    sides = [(math.radians(a), math.radians(b)) for a in (60, 90, 120, 240, 270, 300) for b in (-25, 0, 25)]
+    holes = []
+    for rest in [mean_rest, *rests]:
+        held = HandPose(named_pose(hand, "fist", rest).float(), upright, away)
+        vertices = resolve_contact(hand, skin_surface(hand, rest, held)).vertices
+        cameras = [orbit_camera(vertices, *side, size) for side in sides]
+        shown = [depth_map(vertices, hand.faces, c.viewmat, c.K, size, size).face_ids >= 0 for c in cameras]
+        holes.append(sum(int((binary_fill_holes(mask) & ~mask.numpy()).sum()) for mask in shown))
+    assert holes[0] < 60 and sum(holes) < 500  # 184 and 962 before
 
 
 @pytest.mark.parametrize("name", ["fist", "victory", "ok"])

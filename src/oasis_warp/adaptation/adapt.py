@@ -159,9 +159,10 @@ def adapt(
     gaussians = gaussians._replace(colors=texture.colors)
     if photos.lights is not None:
         weight = photos.observations.confidence * photos.observations.share
-        trust = ((weight * photos.trust).sum(0) + UNSEEN) / (weight.sum(0) + UNSEEN)
+        trusted = (weight * photos.trust).sum(0) + UNSEEN
+        trust = trusted / (weight.sum(0) + UNSEEN)
         hand_share = shade_left(hand, crops[0].rest.vertices)[:, 0]
-        gaussians = split_albedo_shading(hand, calibrated.colors, gaussians, trust, hand_share)
+        gaussians = split_albedo_shading(hand, calibrated.colors, gaussians, trust, hand_share, trusted)
     return result._replace(gaussians=gaussians, losses=texture.losses)
 
 

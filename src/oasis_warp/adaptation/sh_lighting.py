@@ -308,7 +308,7 @@ MARK_BRIGHTNESSES = 0.45, 0.7
 
 def split_albedo_shading(
     hand: HandModel, guess: Float[Tensor, "N 3"], learned: CanonicalGaussians, trust: Float[Tensor, "V"] | None = None,
-    hand_share: Float[Tensor, "V"] | None = None,
+    hand_share: Float[Tensor, "V"] | None = None, seen: Float[Tensor, "V"] | None = None,
 ) -> CanonicalGaussians:  # fmt: skip
     """Split off part of the learned Gaussians' colours as shade; colours times shade stay as they were.
 
@@ -318,15 +318,21 @@ def split_albedo_shading(
         learned: In even light.
         trust: Result of `trust_in_albedo`, 1 if not given: the rest of what was learned is all shade, marks or not.
         hand_share: 0 where the hand turns into the arm and less of what is wide stays, 1 before; 1 if not given.
+        seen: How well the photos show the skin of each vertex, above 0; 1 if not given. What is wide is a mean of what
+            they show: with the rest, the dark skin that a photo shows on a slant was a fine line where it ends.
     """
     ratio = learned.colors.clamp_min(MIN_COLOR) / guess.clamp_min(MIN_COLOR)
     beyond = ratio.log().clamp(-MAX_LOG_SHADE, MAX_LOG_SHADE)
     of_vertices = vertex_colors(learned._replace(colors=beyond), len(hand.template))
     faces, no_mark = hand.faces.to(guess.device), 1 - mark_probability(of_vertices)
     edges = surface.mesh_edges(faces)
-    narrow = surface.smooth_over_mesh(of_vertices, edges, FINE_PASSES_AT_WRIST)
+    trust, hand_share, seen = (
+        torch.ones_like(no_mark[:, 0]) if share is None else share for share in (trust, hand_share, seen)
+    )
+    weighted = torch.cat([of_vertices, torch.ones_like(no_mark)], 1) * seen[:, None]
+    narrow = surface.smooth_over_mesh(weighted, edges, FINE_PASSES_AT_WRIST)
     smooth = surface.smooth_over_mesh(narrow, edges, FINE_PASSES - FINE_PASSES_AT_WRIST)
-    trust, hand_share = (torch.ones_like(no_mark[:, 0]) if share is None else share for share in (trust, hand_share))
+    narrow, smooth = (part[:, :3] / part[:, 3:] for part in (narrow, smooth))
     smooth = torch.lerp(narrow, smooth, hand_share[:, None])
     read = vertex_to_gaussians(torch.cat([smooth, no_mark, trust[:, None]], 1), faces, learned)
     fine = beyond - read[:, :3]

@@ -32,19 +32,19 @@ Thumb = tuple[float, float, float, float, float]
 """Flexion, abduction and twist of the thumb's base, flexion of its two outer joints [degrees]."""
 
 _FIST: dict[str, Finger] = {
-    "index": (82, 110, 52, -3),
-    "middle": (86, 110, 59, -2),
+    "index": (82, 100, 50, 1),
+    "middle": (86, 110, 56, -1),
     "ring": (79, 110, 62, 4),
     "little": (70, 106, 62, 6),
 }
 
 # Flexion is relative to a straight finger. Abduction, and all angles of the thumb's base, are relative to rest and
 # positive towards the thumb. Where the thumb touches a finger, the angles give the smallest gap without
-# self-intersection.
+# self-intersection. With the index bent as far as the others, light came through a fist along all fingers.
 _THUMBS: dict[str, Thumb] = {
     "open": (-10, 14, 0, 0, 0),
     "relaxed": (8, -4, 0, 14, 16),
-    "fist": (28, 15, -14, 42, 68),
+    "fist": (28, 15, -14, 45, 68),
     "pinch": (35, 10, -10, 2, 5),
     "thumbs_up": (-14, 16, 0, 3, -10),
     "victory": (43, 15, -18, 37, 44),
