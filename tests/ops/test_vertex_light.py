@@ -70,7 +70,7 @@ def test_dark_light_and_no_surface_are_no_special_case(scene, device):
     light, on, seen, _ = scene
     dark = light._replace(harmonics=torch.zeros_like(light.harmonics), limits=torch.zeros_like(light.limits))
     assert not vertex_light(dark, on, seen)[..., :3].any()
-    mesh, rules = sky.sky_mesh(torch.device(device)), Rules(2.2, *[(0.0, 0.0, 0.0)] * 3, *[float(k) for k in range(10)])
+    mesh, rules = sky.sky_mesh(torch.device(device)), Rules(2.2, *[(0.0, 0.0, 0.0)] * 3, *[float(k) for k in range(12)])
     coarse = Coarse(mesh.vertices, mesh.nearby, mesh.corners)
     photo = InPhoto(light.facing, light.shade, light.doubt, None)
     none = light_vertices(on.normals[:0], light.harmonics, light.limits, rules, coarse, photo=photo)

@@ -84,6 +84,7 @@ void light_vertices(
                     const V3 s = get3(shade + 3ll * i, count);
                     const V by[3] = {s.x, s.y, s.z};
                     for (int c = 0; c < 3; c++) color[c] *= 1.f + deep * (by[c] - 1.f);
+                    weak = beside_deep(deep, weak, s.x, s.y, s.z);
                 }
             }
             float columns[5][16];

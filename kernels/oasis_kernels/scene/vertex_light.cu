@@ -65,6 +65,7 @@ __global__ void light_vertices(
         }
         if (viewed) deep *= viewed[b], weak *= viewed[b];
         for (int c = 0; shade && c < 3; c++) color[c] *= 1.f + deep * (shade[3 * v + c] - 1.f);
+        if (shade) weak = beside_deep(deep, weak, shade[3 * v], shade[3 * v + 1], shade[3 * v + 2]);
     }
     for (int c = 0; c < 3; c++) out[5 * at + c] = color[c];
     out[5 * at + 3] = deep;

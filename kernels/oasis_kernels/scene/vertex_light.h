@@ -3,6 +3,7 @@
 const float gamma = rules[0], deep_inside = rules[10], outside = rules[11];
 const float turned_away = rules[12], facing_alike = rules[13], other_pose = rules[14], same_pose = rules[15];
 const float same_sky = rules[16], other_sky = rules[17], same_beside = rules[18], other_beside = rules[19];
+const float weak_shade = rules[20], deep_shade = rules[21];
 const float *least_light = rules + 1, *in_hollows = rules + 4, *in_crevices = rules + 7;
 // 0 at `from`, 1 at `to`, straight between them.
 auto ramp = [&](V x, V from, V to) -> V { return smallest(largest((x - from) / (to - from), zero), one); };
@@ -31,4 +32,10 @@ auto under_sky = [&](V own, V near, V doubtful, V* deep, V* weak) {
     const V other = other_sky + (other_beside - other_sky) * doubtful;
     *deep = *deep * ramp(near, other, same);
     *weak = *weak * ramp(own + (near - own) * doubtful, other, same);
+};
+// The share of weak shade that stays where the light's own shade is `red`, `green` and `blue`: as of that, if it is
+// deep.
+auto beside_deep = [&](V deep, V weak, V red, V green, V blue) -> V {
+    const V most = largest(largest(magnitude(red - 1.f), magnitude(green - 1.f)), magnitude(blue - 1.f));
+    return weak + ramp(most, (V)(weak_shade), (V)(deep_shade)) * (smallest(weak, deep) - weak);
 };

@@ -10,7 +10,9 @@ from oasis_warp.avatar.anchors import gaussian_corners
 from oasis_warp.avatar.creases import Creases, flat_creases, flat_share
 from oasis_warp.avatar.folds import Folds, Opening, open_folds, opened_by_joints
 from oasis_warp.avatar.vertex_light import (
+    DEEP,
     GAMMA,
+    WEAK,
     Lighting,
     SurfaceLight,
     kernels_take,
@@ -24,9 +26,6 @@ from oasis_warp.ops import RestMesh, pose_mesh_gaussians
 from oasis_warp.ops.corner_reading import Corners, read_corners
 from oasis_warp.ops.gaussian_light import FlatCreases, OpenFolds, light_gaussians
 
-WEAK, DEEP = 0.3, 0.6
-"""Differences of shade from 1 up to which it is relief or tone of the skin itself, and from which it is a sharp shadow,
-gloss, or another part of the hand. Set by eye on one thumb-up photo with gashes, creases and a red spot."""
 MAX_DETAIL = 0.3
 """Difference of the logarithms of colours up to which detail is skin where it goes against the shade: bright beside a
 shadow that is a pixel off, skin would be white where that shadow goes."""

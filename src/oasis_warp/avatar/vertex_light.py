@@ -19,6 +19,9 @@ from oasis_warp.ops.vertex_light import Coarse, InPhoto, Rules, light_vertices
 
 GAMMA = 2.2
 """Light is sRGB to this power, nearly."""
+WEAK, DEEP = 0.3, 0.6
+"""Differences of shade from 1 up to which it is relief or tone of the skin itself, and from which it is a sharp shadow,
+gloss, or another part of the hand. Set by eye on one thumb-up photo with gashes, creases and a red spot."""
 AS_IN_PHOTO, TURNED_AWAY = math.cos(math.radians(5)), math.cos(math.radians(20))
 """Cosines of the angle by which skin has turned from where the photo shows it, up to which its shade stays as it is and
 from which it is gone."""
@@ -41,7 +44,7 @@ MIN_LIGHT = 1e-6
 """Least share of the light that shade makes up for: deep in a fist hardly any arrives."""
 _RULES = Rules(
     GAMMA, sky.LEAST_LIGHT, sky.IN_HOLLOWS, sky.IN_CREVICES, sky.DEEP_INSIDE, sky.OUTSIDE, TURNED_AWAY, AS_IN_PHOTO,
-    OTHER_POSE, SAME_POSE, SAME_SKY, OTHER_SKY, SAME_BESIDE, OTHER_BESIDE,
+    OTHER_POSE, SAME_POSE, SAME_SKY, OTHER_SKY, SAME_BESIDE, OTHER_BESIDE, WEAK, DEEP,
 )  # fmt: skip
 
 
@@ -200,7 +203,8 @@ def vertex_light_in_steps(
     """Factors of the sRGB colours of vertices, then the shares of deep and of weak shade that stay, 0 without any.
 
     `shading`, with the shade of the light, which is smooth or of pixels beside outlines; then `remaining_shade` times
-    `viewed`.
+    `viewed`. Where the shade of the light is deep, weak shade goes with it: in a shadow photos show little but noise,
+    which was a bright scab without the shadow.
     """
     of_vertices = shading(light, on)
     if light.facing is None:
@@ -208,9 +212,12 @@ def vertex_light_in_steps(
     stays = remaining_shade(light, on, seen)
     if viewed is not None:
         stays = stays * viewed[..., None, None]
-    if light.shade is not None:
-        of_vertices = of_vertices * (1 + stays[..., :1] * (light.shade - 1))
-    return torch.cat([of_vertices, stays], -1)
+    if light.shade is None:
+        return torch.cat([of_vertices, stays], -1)
+    of_vertices = of_vertices * (1 + stays[..., :1] * (light.shade - 1))
+    deep, weak = stays.split(1, -1)
+    of_deep = (((light.shade - 1).abs().amax(-1, keepdim=True) - WEAK) / (DEEP - WEAK)).clamp(0, 1)
+    return torch.cat([of_vertices, deep, torch.lerp(weak, torch.minimum(weak, deep), of_deep)], -1)
 
 
 def _vertex_light_at_once(

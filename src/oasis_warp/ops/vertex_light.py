@@ -39,6 +39,8 @@ class Rules(NamedTuple):
     other_sky: float
     same_beside: float
     other_beside: float
+    weak: float
+    deep: float
 
 
 class InPhoto(NamedTuple):

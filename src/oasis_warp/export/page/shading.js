@@ -96,7 +96,10 @@ function lightVertices(body, shading, light, viewed) {
     deep[v] = held * left(nearby[v]);
     lightVertex(light, bounce, x, y, z, sky.exposure, body.contact.closeness[v], factors, 4 * v);
     if (shade) for (let c = 0; c < 3; c++) factors[4 * v + c] *= 1 + deep[v] * (shade[3 * v + c] - 1);
-    factors[4 * v + 3] = left(mixed(change[v], nearby[v]));
+    const weak = left(mixed(change[v], nearby[v]));
+    let most = 0; // of the light's own shade: where it is deep, weak shade goes with it
+    if (shade) for (let c = 0; c < 3; c++) most = Math.max(most, Math.abs(shade[3 * v + c] - 1));
+    factors[4 * v + 3] = weak + between(most, WEAK, DEEP) * (Math.min(weak, deep[v]) - weak);
   }
 }
 
