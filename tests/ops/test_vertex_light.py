@@ -65,6 +65,21 @@ def test_gradients_take_the_steps(scene):
     torch.testing.assert_close(out.detach(), vertex_light(light, on, seen, viewed), atol=1e-5, rtol=1e-5)
 
 
+def test_weak_shade_goes_with_the_deep_shade_of_the_light(scene):
+    """The noise of a deep shadow stayed on bright skin, as a scab, when the finger that cast it had moved."""
+    light, on, _, _ = scene
+    n = len(light.facing)
+    dark = torch.arange(n, device=light.facing.device) % 2 == 0
+    light = light._replace(shade=torch.where(dark[:, None], 0.2, 0.9).expand(n, 3).contiguous(), doubt=None)
+    moved = light.facing.clone()
+    moved[n // 3 :] *= -1  # most of the hand faces elsewhere, so that deep shade ends on all of it
+    stays = vertex_light(light, Lighting(torch.stack([light.facing, moved]), None), None)[..., 3:]
+    assert float(stays[0].min()) > 0.99
+    deep, weak = stays[1, : n // 3].unbind(-1)
+    assert float(deep.max()) == 0 and float(weak[dark[: n // 3]].max()) == 0
+    assert float(weak[~dark[: n // 3]].min()) > 0.99
+
+
 def test_dark_light_and_no_surface_are_no_special_case(scene, device):
     """log(0) is not finite."""
     light, on, seen, _ = scene

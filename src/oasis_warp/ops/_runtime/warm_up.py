@@ -37,7 +37,7 @@ def warm_up(device: torch.device | str = "cpu") -> None:
         each, none = each.int(), each[:1, None].int()
         sky = sky_exposure(vertices[None], vertices[None], each, faces, quats[:1], ones.new_ones(9, 3))
         coarse = Coarse(each, each[:, None], Corners(each[:, None].expand(4, 3), thirds))
-        rules, photo = Rules(1.0, *[(1.0, 1.0, 1.0)] * 3, *map(float, range(10))), InPhoto(vertices, None, None, ones)
+        rules, photo = Rules(1.0, *[(1.0, 1.0, 1.0)] * 3, *map(float, range(12))), InPhoto(vertices, None, None, ones)
         read_corners(sky, coarse.corners)
         columns = light_vertices(vertices[None], scales, scales[:2], rules, coarse, sky, ones[:3], photo=photo)
         light_gaussians(columns, coarse.corners, thirds, thirds, (0.0, 1.0))
