@@ -67,7 +67,7 @@ def test_gradients_take_the_steps(scene):
 
 def test_weak_shade_goes_with_the_deep_shade_of_the_light(scene):
     """The noise of a deep shadow stayed on bright skin, as a scab, when the finger that cast it had moved."""
-    light, on, _, _ = scene
+    light, *_ = scene
     n = len(light.facing)
     dark = torch.arange(n, device=light.facing.device) % 2 == 0
     light = light._replace(shade=torch.where(dark[:, None], 0.2, 0.9).expand(n, 3).contiguous(), doubt=None)
