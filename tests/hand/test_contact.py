@@ -30,7 +30,7 @@ def posed(hand, name, seed):
 
 @pytest.fixture(scope="module")
 def fist(hand):
-    """Its fingers pass through each other and the palm: 1073 edges cross."""
+    """Its fingers pass through each other and the palm: 1040 edges cross."""
     return posed(hand, "fist", 105)
 
 

@@ -32,8 +32,8 @@ Thumb = tuple[float, float, float, float, float]
 """Flexion, abduction and twist of the thumb's base, flexion of its two outer joints [degrees]."""
 
 _FIST: dict[str, Finger] = {
-    "index": (82, 100, 50, 1),
-    "middle": (86, 110, 56, -1),
+    "index": (86, 103, 52, 1),
+    "middle": (86, 110, 57, -1),
     "ring": (79, 110, 62, 4),
     "little": (70, 106, 62, 6),
 }
