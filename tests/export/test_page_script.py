@@ -14,7 +14,7 @@ from tests.export.page_parts import LARGEST, section
 
 from oasis_kernels import constants
 from oasis_kernels.scene import sky_exposure as kernels
-from oasis_warp.avatar import pose, vertex_light
+from oasis_warp.avatar import vertex_light
 from oasis_warp.avatar.sky import studio_light
 from oasis_warp.core.camera import ORBIT_FIELD_OF_VIEW, orbit_camera
 from oasis_warp.export.page_data import NO_JOINT, unpack_data
@@ -36,8 +36,8 @@ NODE = shutil.which("node")
         ("shading.js", "SAME_BESIDE", vertex_light.SAME_BESIDE),
         ("shading.js", "OTHER_BESIDE", vertex_light.OTHER_BESIDE),
         ("shading.js", "NO_JOINT", NO_JOINT),
-        ("shading.js", "WEAK", pose.WEAK),
-        ("shading.js", "DEEP", pose.DEEP),
+        ("shading.js", "WEAK", vertex_light.WEAK),
+        ("shading.js", "DEEP", vertex_light.DEEP),
         ("sky.js", "BUFFER", kernels.SIZE),
         ("sky.js", "MARGIN", kernels.MARGIN),
         ("sky.js", "LIFT", kernels.LIFT),
