@@ -198,7 +198,7 @@ def test_fingers_of_a_fist_lie_as_close_as_on_the_mean_hand(hand, rests, mean_re
         assert median(made) < expected + 0.0005 and max(made) < expected + 0.002, pair
 
 
-def test_nothing_can_be_seen_through_a_fist(hand, rests, mean_rest):
+def test_little_can_be_seen_through_a_fist(hand, rests, mean_rest):
     """Fingers that were bent alike formed a tube: from a side, all of 32 fists showed what is behind."""
     upright = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
     away, size = torch.tensor([0, 0, 0.5]), 128

@@ -319,7 +319,7 @@ def split_albedo_shading(
         trust: Result of `trust_in_albedo`, 1 if not given: the rest of what was learned is all shade, marks or not.
         hand_share: 0 where the hand turns into the arm and less of what is wide stays, 1 before; 1 if not given.
         seen: How well the photos show the skin of each vertex, above 0; 1 if not given. What is wide is a mean of what
-            they show: with the rest, the dark skin that a photo shows on a slant was a fine line where it ends.
+            they show: with the rest, skin that a photo shows dark on a slant kept a dark edge where the photo ends.
     """
     ratio = learned.colors.clamp_min(MIN_COLOR) / guess.clamp_min(MIN_COLOR)
     beyond = ratio.log().clamp(-MAX_LOG_SHADE, MAX_LOG_SHADE)
