@@ -6,7 +6,7 @@ import pytest
 import torch
 from synthetic import crop_of
 
-from oasis_warp.adaptation.sh_lighting import (
+from oasis_warp.adaptation.albedo_split import (
     ALBEDO_SHARE,
     DARKEST_FINE,
     MOST_HUE,
@@ -67,7 +67,8 @@ def test_a_shadow_goes_and_marks_stay(hand, albedo_scene):
         before, after = ((g.colors / guess.colors).log()[there] for g in (learned, parted))
         return float(after.norm() / before.norm())
 
-    assert share_that_stays(SHADOW, inner) == pytest.approx(ALBEDO_SHARE, abs=0.03)  # its border is fine detail
+    assert share_that_stays((0.8, 0.7, 0.6), inner) == pytest.approx(ALBEDO_SHARE, abs=0.03)  # its border is fine
+    assert share_that_stays(SHADOW, inner) < 0.01  # too dark for skin
     assert share_that_stays(HALF_INK) > 0.4
     assert share_that_stays(INK) > 0.95 and share_that_stays(POLISH) > 0.95  # but for faces at the border
 
@@ -133,6 +134,34 @@ def test_shade_leaves_no_line_where_what_the_photo_shows_ends(hand, albedo_scene
 
     assert float(left(seen.clamp_min(0.02)).min()) == pytest.approx(-0.3 * ALBEDO_SHARE, abs=0.03)
     assert float(left(None).min()) < -0.15
+
+
+def test_skin_that_gets_darker_up_to_where_the_photo_ends_keeps_no_dark_edge(hand, albedo_scene):
+    """Its mean was one of brighter skin only, and the last centimetre was a dark patch with a hard edge."""
+    guess, _ = albedo_scene
+    before_end = (hand.template[:, 0].median() - hand.template[:, 0]) / 0.02
+    seen = (before_end > 0).float()
+    shown = vertex_to_gaussians((seen * (1 - before_end).clamp(0, 1))[:, None], hand.faces, guess)
+    learned = guess._replace(colors=guess.colors * (-0.4 * shown).exp())
+    parted = split_albedo_shading(hand, guess.colors, learned, seen=seen.clamp_min(0.02))
+    left = (parted.colors / guess.colors).log().mean(1)[(shown[:, 0] > 0.9) & (learned.colors > 0.03).all(1)]
+    assert float(left.mean()) > -0.15  # -0.18 with a mean; ALBEDO_SHARE alone leaves -0.08
+
+
+def test_nothing_stays_of_a_fold_too_dark_for_skin(hand, albedo_scene):
+    """The fold of a squeezed palm was a dark red wound in the opened one."""
+    guess, _ = albedo_scene
+    line = (torch.sin(hand.template[:, :1] * 2 * math.pi / 0.03) > 0.9).float()
+    on_line = vertex_to_gaussians(line, hand.faces, guess)
+
+    def darkest(fold):
+        learned = guess._replace(colors=guess.colors * (on_line * torch.tensor(fold)).exp())
+        parted = split_albedo_shading(hand, guess.colors, learned)
+        left = (parted.colors / guess.colors).log().mean(1)
+        return float(left[(on_line[:, 0] > 0.9) & (learned.colors > 0.03).all(1)].min())
+
+    assert darkest([-0.8, -1.0, -1.2]) > -0.01
+    assert darkest([-0.3, -0.3, -0.3]) < -0.2  # a crease
 
 
 def test_what_was_not_learned_does_not_change(hand, albedo_scene):

@@ -7,10 +7,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from oasis_warp.adaptation.albedo_split import split_albedo_shading
 from oasis_warp.adaptation.inpainting import inpaint
 from oasis_warp.adaptation.prior_guess import Calibration, calibrate, mix_guesses
 from oasis_warp.adaptation.reliability import VertexObservations, observe_photos, photo_gains
-from oasis_warp.adaptation.sh_lighting import match_light, split_albedo_shading
+from oasis_warp.adaptation.sh_lighting import match_light
 from oasis_warp.adaptation.sharpen import sharpen
 from oasis_warp.adaptation.texture import Targets, learn_lora, learn_texture, make_targets, reference_azimuths
 from oasis_warp.adaptation.unlit import (
@@ -159,10 +160,10 @@ def adapt(
     gaussians = gaussians._replace(colors=texture.colors)
     if photos.lights is not None:
         weight = photos.observations.confidence * photos.observations.share
-        trusted = (weight * photos.trust).sum(0) + UNSEEN
+        trusted = (weight * photos.trust).sum(0)
         trust = trusted / (weight.sum(0) + UNSEEN)
         hand_share = shade_left(hand, crops[0].rest.vertices)[:, 0]
-        gaussians = split_albedo_shading(hand, calibrated.colors, gaussians, trust, hand_share, trusted)
+        gaussians = split_albedo_shading(hand, calibrated.colors, gaussians, trust, hand_share, trusted + UNSEEN)
     return result._replace(gaussians=gaussians, losses=texture.losses)
 
 

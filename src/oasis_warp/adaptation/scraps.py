@@ -6,7 +6,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from oasis_warp.adaptation.sh_lighting import ACROSS_SHADING, MIN_COLOR
+from oasis_warp.adaptation.albedo_split import ACROSS_SHADING
+from oasis_warp.adaptation.sh_lighting import MIN_COLOR
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import HandCrop
 from oasis_warp.core.windows import largest_around, smooth_mean_around

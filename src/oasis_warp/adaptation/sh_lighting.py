@@ -1,22 +1,14 @@
-"""The light of a photo as spherical harmonics, and the split of what they do not explain into albedo and shade.
-
-Two photos of one hand agree on little of what they show beyond the prior. Where skin faces as before, a third to a half
-of it is found again; where skin has turned by more than 45 degrees, a tenth at most (docs/avatar.md). The rest is
-shadows, gloss, wrinkles of the pose, and misplaced detail. So most of what is wide becomes shade: the photo's own view
-keeps it and other poses lose it. Marks whose colours light cannot give to skin stay in the albedo as a whole, and so
-does what is fine: a hand without pores, creases and relief looks like wax.
-"""
+"""The light of a photo as spherical harmonics."""
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from oasis_warp.adaptation.inpainting import inpaint
-from oasis_warp.avatar.anchors import rim_fade, vertex_colors, vertex_to_gaussians
+from oasis_warp.avatar.anchors import rim_fade, vertex_to_gaussians
 from oasis_warp.avatar.observation import Observation, observe
 from oasis_warp.avatar.sky import arriving, harmonic_basis
 from oasis_warp.avatar.vertex_light import GAMMA, Lighting, posed_lighting, shading
-from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandLight
 from oasis_warp.core.windows import mean_around
@@ -67,8 +59,6 @@ OCCLUDER_FADE = 0.001
 """Distance over which the shade of pixels that may not show the skin ends [m]."""
 MIN_COLOR = 0.02
 """Colours are clamped to it before their logarithm is taken [sRGB]."""
-MIN_SHOWN = 1e-3
-"""Least colour that comes out of colours and shade, which is a factor above 0."""
 MIN_LIGHT = 0.25
 """Least light relative to the mean, because colours are divided by it. With .05 the palm of one hand in low light from
 one side was a dark patch beside a bright streak."""
@@ -278,78 +268,3 @@ def weighted_deviation(values: Float[Tensor, "V 3"], weight: Float[Tensor, "V"])
     order = size.argsort()
     below = weight[order].cumsum(0)
     return size[order][torch.searchsorted(below, below[-1] / 2).clamp_max(len(order) - 1)]
-
-
-ALBEDO_SHARE, FINE_SHARE = 0.2, 1.0
-"""Share of a difference that is no mark which becomes albedo, and that of its fine part: creases, folds and the rims of
-nails stay on the skin, and light hardly changes so fast on it, but in sharp shadows beside outlines, which go before
-(`scraps`). Set by eye, as the two below; with .8 of the fine part, ten photos of same_hand keep .02 less of their
-contrast in other poses."""
-FINE_PASSES, FINE_PASSES_AT_WRIST = 60, 9
-"""Smoothings over the mesh that leave the wide part, about 15 mm and 6 mm. With 9 everywhere, four photos of same_hand
-keep .65 of their contrast at 4-8 px in other poses, with 60 .72; but where the hand turns into the arm, wider folds are
-smears on a hand without its arm."""
-DARKEST_FINE, BRIGHTEST_FINE, MOST_HUE = 0.3, 0.15, 0.06
-"""Largest fine part that is darker, that is brighter, and that differs between channels, as logarithms; more is a sharp
-shadow, gloss, or another part of the hand. With .3 for all, folds of a squeezed palm stayed as red gashes, and the
-light on a finger's tip as white spots; eight photos of same_hand lose .01 of their contrast in other poses."""
-ACROSS_SHADING = ((-18.0, 21.3, -7.5), (8.8, 4.6, -8.1))
-"""Shading moves the logarithms of skin colours along one line, from dark and red to bright and pale. These two
-directions are perpendicular to it, each divided by the standard deviation there, measured on photos of bare hands."""
-MARK_DISTANCES = 3.5, 7.0
-"""Distances from that line, in standard deviations, at which a difference begins to count as a mark and at which it
-surely is one. 98 % of the vertices of bare skin are below the first; half-transparent ink has 5, ink 15, polish 24."""
-SHADOW_SLOPE = 0.6
-"""By how much those distances grow for each unit by which a difference is dark and redder than the line: deep between
-fingers light has come through skin. Set on a shadow beside a thumb in one photo of same_hand; ink is not redder."""
-MARK_BRIGHTNESSES = 0.45, 0.7
-"""The same for the mean of the logarithms, for bright marks: 99 % of bare skin is below the first."""
-
-
-def split_albedo_shading(
-    hand: HandModel, guess: Float[Tensor, "N 3"], learned: CanonicalGaussians, trust: Float[Tensor, "V"] | None = None,
-    hand_share: Float[Tensor, "V"] | None = None, seen: Float[Tensor, "V"] | None = None,
-) -> CanonicalGaussians:  # fmt: skip
-    """Split off part of the learned Gaussians' colours as shade; colours times shade stay as they were.
-
-    Args:
-        hand: Model of the surface.
-        guess: Colours of the Gaussians before they were learned.
-        learned: In even light.
-        trust: Result of `trust_in_albedo`, 1 if not given: the rest of what was learned is all shade, marks or not.
-        hand_share: 0 where the hand turns into the arm and less of what is wide stays, 1 before; 1 if not given.
-        seen: How well the photos show the skin of each vertex, above 0; 1 if not given. What is wide is a mean of what
-            they show: with the rest, skin that a photo shows dark on a slant kept a dark edge where the photo ends.
-    """
-    ratio = learned.colors.clamp_min(MIN_COLOR) / guess.clamp_min(MIN_COLOR)
-    beyond = ratio.log().clamp(-MAX_LOG_SHADE, MAX_LOG_SHADE)
-    of_vertices = vertex_colors(learned._replace(colors=beyond), len(hand.template))
-    faces, no_mark = hand.faces.to(guess.device), 1 - mark_probability(of_vertices)
-    edges = surface.mesh_edges(faces)
-    trust, hand_share, seen = (
-        torch.ones_like(no_mark[:, 0]) if share is None else share for share in (trust, hand_share, seen)
-    )
-    weighted = torch.cat([of_vertices, torch.ones_like(no_mark)], 1) * seen[:, None]
-    narrow = surface.smooth_over_mesh(weighted, edges, FINE_PASSES_AT_WRIST)
-    smooth = surface.smooth_over_mesh(narrow, edges, FINE_PASSES - FINE_PASSES_AT_WRIST)
-    narrow, smooth = (part[:, :3] / part[:, 3:] for part in (narrow, smooth))
-    smooth = torch.lerp(narrow, smooth, hand_share[:, None])
-    read = vertex_to_gaussians(torch.cat([smooth, no_mark, trust[:, None]], 1), faces, learned)
-    fine = beyond - read[:, :3]
-    grey = fine.mean(1, keepdim=True)
-    fine = grey.clamp(-DARKEST_FINE, BRIGHTEST_FINE) + (fine - grey).clamp(-MOST_HUE, MOST_HUE)
-    skin = ALBEDO_SHARE * beyond + (FINE_SHARE - ALBEDO_SHARE) * fine
-    albedo = read[:, 4:] * torch.lerp(beyond, skin, read[:, 3:4])
-    colors = (guess.clamp_min(MIN_COLOR) * albedo.exp()).clamp(max=1)
-    return learned._replace(colors=colors, shade=learned.colors.clamp_min(MIN_SHOWN) / colors)
-
-
-def mark_probability(beyond: Float[Tensor, "V 3"]) -> Float[Tensor, "V 1"]:
-    """Probability that a difference of the logarithms of colours is a mark on the skin and not light."""
-    across, bright = beyond @ beyond.new_tensor(ACROSS_SHADING).T, beyond.mean(-1)
-    wider = torch.where(across[..., 0] < 0, 1 + SHADOW_SLOPE * (-bright).clamp_min(0), 1)
-    likely = [
-        ((measure - low) / (high - low)).clamp(0, 1)
-        for measure, (low, high) in ((across.norm(dim=-1) / wider, MARK_DISTANCES), (bright, MARK_BRIGHTNESSES))
-    ]
-    return torch.maximum(*likely)[:, None]
