@@ -273,7 +273,7 @@ def shapes(count, noise, seed=0):
 def test_shapes_that_agree_are_kept():
     true, _ = shapes(0, 0.0)
     for count in (1, 2, 5):
-        assert torch.allclose(shared_shape([true] * count), true, atol=1e-6)
+        assert torch.allclose(shared_shape([true] * count, torch.zeros(40)), true, atol=1e-6)
 
 
 def test_the_shared_shape_is_nearer_to_the_truth_than_one_photo_and_than_their_mean():
@@ -282,13 +282,14 @@ def test_the_shared_shape_is_nearer_to_the_truth_than_one_photo_and_than_their_m
         true, predicted = shapes(3, 1.5, seed)
         alone.append((predicted[0] - true).norm())
         mean.append((torch.stack(predicted).mean(0) - true).norm())
-        shared.append((shared_shape(predicted) - true).norm())
+        shared.append((shared_shape(predicted, torch.zeros(40)) - true).norm())
     assert sum(shared) < 0.95 * sum(mean) < 0.8 * sum(alone)
 
 
-def test_shapes_that_contradict_each_other_leave_the_mean_hand():
+def test_shapes_that_contradict_each_other_leave_the_expected_hand():
     true, _ = shapes(0, 0.0)
-    assert torch.equal(shared_shape([true, -0.9 * true]), torch.zeros(40))
+    expected = torch.linspace(-1, 1, 40)
+    assert torch.equal(shared_shape([expected + true, expected - 0.9 * true], expected), expected)
 
 
 # ---- the whole set

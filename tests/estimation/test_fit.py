@@ -29,8 +29,7 @@ def posed_hand(kinematics, seed):
     fitter = Fitter(kinematics, fit_target(np.zeros((21, 2)), None, SIZE, 500.0))
     spread = 0.25 * ANGLE_SIGMA[kinematics.dofs[:, 1]]
     angles = np.clip(fitter.relaxed + spread * rng.normal(size=26), fitter.low, fitter.high)
-    shape = 0.7 * rng.normal(size=40)
-    shape[6:10] = 0
+    shape = fitter.shape_mean + 0.7 * fitter.shape_sigma * rng.normal(size=40)
     facing = cv2.Rodrigues(np.array([np.pi / 2 + np.pi * rng.integers(2), 0, 0]))[0]
     tilt = cv2.Rodrigues(rng.normal(size=3) * 0.3)[0]
     rotation = tilt @ cv2.Rodrigues(np.array([0, 0, rng.uniform(-np.pi, np.pi)]))[0]

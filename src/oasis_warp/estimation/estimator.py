@@ -37,6 +37,7 @@ from oasis_warp.estimation.pixel_reading import (
     surface_reading,
 )
 from oasis_warp.estimation.segmentation import check_opencv, mask_from_alpha, mask_from_reading
+from oasis_warp.estimation.shape_prior import shape_prior
 from oasis_warp.hand.kinematics import HandKinematics
 
 _NO_HAND = 16
@@ -204,13 +205,13 @@ def choose_hand(
     raise InputError(f"{photo_name}: expected {wanted}, found {listed}; choose another --hand, or mirror the photo.")
 
 
-def shared_shape(shapes: Sequence[Float[Tensor, "S"]]) -> Float[Tensor, "S"]:
-    """The mean of the shapes fitted to photos of one hand, shrunk towards the mean hand as far as they disagree.
+def shared_shape(shapes: Sequence[Float[Tensor, "S"]], expected: Float[Tensor, "S"]) -> Float[Tensor, "S"]:
+    """The mean of the shapes fitted to photos of one hand, shrunk towards the `expected` one as far as they disagree.
 
     One photo does not determine a shape, and errors of its landmarks decide the rest. The spread of the shapes s_k of K
-    photos estimates these errors: with W the sum of their sample variances, the mean m becomes
+    photos estimates these errors: with W the sum of their sample variances and e the expected shape, the mean m becomes
 
-        m max(0, 1 - W / (K |m|^2)),
+        e + (m - e) max(0, 1 - W / (K |m - e|^2)),
 
     the positive-part shrinkage of James and Stein (1961) with estimated variance. Shapes that agree are kept. On
     synthetic hands and on held-out photos of real ones this explains more than any photo's own shape, their mean, or
@@ -218,13 +219,15 @@ def shared_shape(shapes: Sequence[Float[Tensor, "S"]]) -> Float[Tensor, "S"]:
 
     Args:
         shapes: Coefficients [standard deviations], of one photo or more.
+        expected: Those of the prior.
     """
     table = torch.stack(list(shapes))
     mean = table.mean(0)
     if len(table) == 1:
         return mean
     noise = table.var(0).sum() / len(table)
-    return mean * (1 - noise / mean.square().sum().clamp_min(1e-12)).clamp_min(0)
+    apart = mean - expected
+    return expected + apart * (1 - noise / apart.square().sum().clamp_min(1e-12)).clamp_min(0)
 
 
 def check_sides(photos: Sequence[Photo], landmarks: Sequence[Landmarks | HandFit]) -> None:
@@ -282,7 +285,8 @@ def fit_together(
         progress("fit", len(fits), total)
     if len(fits) == 1:
         return fits
-    shape, again = shared_shape([fit.shape for fit in fits]), []
+    expected = real(shape_prior(estimator.kinematics.hand)[0])
+    shape, again = shared_shape([fit.shape for fit in fits], expected), []
     for photo, points in pairs:
         again.append(estimator.fit(photo, points, shape=shape, force=True)._replace(shape=shape))
         progress("fit", len(pairs) + len(again), total)

@@ -16,6 +16,7 @@ from oasis_warp.estimation.fit_problem import FitState, FitTarget, Linearized
 from oasis_warp.estimation.gesture_prior import gesture_prior
 from oasis_warp.estimation.landmarks import BONES
 from oasis_warp.estimation.least_squares import Damping, QuadraticModel, cauchy, charbonnier, minimize
+from oasis_warp.estimation.shape_prior import shape_prior
 from oasis_warp.hand.kinematics import HandKinematics, PosedJoints, cross_matrices, rotation_between, unit
 
 _PALM = [0, *KNUCKLES]
@@ -44,7 +45,6 @@ class FitSettings:
     148 synthetic photos of a world of their own, with a look at the fits of the 66 test photos."""
     relaxed: tuple[float, float, float] = (0.25, 0.45, 0.25)
     """Flexion of a finger's three joints from which fits start [rad]."""
-    shape: float = 1.0
     silent_shape: float = 0.0003
     """Principal components that move the surface less than this are fixed, because no photo shows them [m, rms]."""
     outline: float = 0.010
@@ -138,10 +138,11 @@ class Fitter:
         self.low, self.high = kinematics.limits[joint, axis].T
         n_shape = kinematics.shape_basis.shape[2]
         if shape is None:
-            self.shape_mean, self.shape_sigma = np.zeros(n_shape), np.full(n_shape, s.shape)
+            self.shape_mean, self.shape_sigma = shape_prior(kinematics.hand)
             principal = np.array([name.startswith("pc") for name in kinematics.hand.shape_names])
             size = np.sqrt((kinematics.shape_basis**2).sum(1).mean(0))
-            self.shape_sigma[principal & (size < s.silent_shape)] = _FIXED
+            silent = principal & (size < s.silent_shape)
+            self.shape_mean[silent], self.shape_sigma[silent] = 0.0, _FIXED
         else:
             self.shape_mean, self.shape_sigma = np.asarray(shape, np.float64), np.full(n_shape, _FIXED)
         diagonal = np.hypot(*target.size)
