@@ -26,8 +26,8 @@ MANY_FINGERS = 4
 """A hand with this many doubtful fingers is somewhere else."""
 _ANY_POSE = FitSettings(gesture=(1.0, 1.0, 1.0))
 """Of the fits that tell the sides apart: a flat hand of the other side makes a gesture, too."""
-_SIDE_RATIO = 1.15
-"""Ratio of the other side's cost to this one's below which the side is doubtful; at least 1.22 on 66 correct fits."""
+_SIDE_RATIO = 1.1
+"""Ratio of the other side's cost to this one's below which the side is doubtful; at least 1.14 on 66 correct fits."""
 _FINGER_GAP = 0.06
 """Distance of a finger in the second detection, as a fraction of the box; at most .04 where it is correct."""
 _CROP_ROTATION = 0.3
