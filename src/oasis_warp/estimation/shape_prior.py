@@ -1,7 +1,7 @@
 """The prior of hand shapes, measured on photos of real hands.
 
 The bundled model comes from bodies drawn by artists, and its mean hand has a long palm: 99 mm from the wrist to the
-middle knuckle at a first phalanx of 45 mm. Photos of real hands are fitted with some 87 mm at 43 mm.
+middle knuckle at a first phalanx of 45 mm. Photos of real hands ask for 91 mm at 45 mm, and differ less than the model.
 """
 
 import numpy as np
