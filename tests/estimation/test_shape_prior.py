@@ -9,7 +9,7 @@ from oasis_warp.estimation.shape_prior import ANY, DEVIATION, MEANS, shape_prior
 
 
 def test_the_palm_of_the_expected_hand_is_as_long_as_a_real_one(hand):
-    """The model's own mean hand has .46 of first phalanx to palm, real hands .5 (Buryanov and Kotiuk 2010: 44.6 mm)."""
+    """The model's own mean hand has .46 of first phalanx to palm, fits to photos .49."""
     means, _ = shape_prior(hand)
     joints = hand.joints + hand.joint_basis @ torch.from_numpy(means).float()
     wrist, knuckle, middle = (joints[hand.joint_names.index(name)] for name in ("wrist", "middle1", "middle2"))
