@@ -24,7 +24,7 @@ tests/data/photos, fitted again with the mean before as their prior, but for the
 photo shows. So the tip of the middle finger lies 186 mm from the wrist."""
 DEVIATION = 0.5
 """Standard deviation of each. Fits to photos of one hand scattered by as much where the prior had a deviation of 1, and
-means of different hands by less in nearly all coefficients."""
+means of different hands by less."""
 ANY = 1.0
 """That of hands whose shape no photos tell: of MANO."""
 
