@@ -6,10 +6,13 @@ import pytest
 import torch
 from synthetic import crop_of
 
+from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.avatar.pose import pose_gaussians
 from oasis_warp.core import surface
+from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.estimation.fit_problem import mirrored_fit
 from oasis_warp.estimation.fit_quality import iou_above_wrist
+from oasis_warp.estimation.hand_crop import crop_hand
 from oasis_warp.estimation.outline import silhouette
 from oasis_warp.estimation.surface_offsets import (
     BEYOND,
@@ -20,6 +23,7 @@ from oasis_warp.estimation.surface_offsets import (
     rendered_outline_offsets,
 )
 from oasis_warp.hand.contact import flesh_thickness
+from oasis_warp.network.prior import choose_prior
 from oasis_warp.render import render
 
 RIGHT, LEFT = "victory_right_09.jpg", "ok_sign_left_10.jpg"
@@ -216,6 +220,17 @@ def test_a_slit_that_the_photo_does_not_have_is_closed(hand):
     before, after = (drawn(hand, gaussians, e)[slit].mean() for e in (crop, closer))
     assert before < 0.2
     assert after > 0.5  # .41 where only outlines are met
+
+
+def test_a_slit_that_has_closed_stays_closed(hand, fitted, offsets):
+    photo, _, fit = fitted(LEFT)
+    crop = crop_hand(photo, fit, offsets(LEFT), ReconstructConfig(), 384)
+    guess = choose_prior("learned")(crop)
+    inside = inner_mask((crop.mask > 0.5).float()) * crop.above_wrist > 0.5
+    closer = moved_by(hand, crop, rendered_outline_offsets(hand, [guess], [crop]))
+    before, after = (int((drawn(hand, guess, e)[inside] < 0.5).sum()) for e in (crop, closer))
+    assert before > 50
+    assert after < 10  # 17 where the sides of a closed slit lose their targets
 
 
 def test_what_lies_off_the_outline_stays(hand, rendered_offsets):

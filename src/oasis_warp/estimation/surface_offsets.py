@@ -109,19 +109,21 @@ def rendered_outline_offsets(
     ]
     sheet = sheet or ThinSheet(hand)
     outward = np.zeros(len(hand.template))
+    target, weight = np.zeros((2, len(crops), len(outward)))
     for _ in range(_RENDERED_ROUNDS):
         step = torch.from_numpy(outward).to(like)[:, None]
-        observed = []
-        for guess, crop, (at_rest, posed) in zip(guesses, crops, normals, strict=True):
+        for k, (guess, crop, (at_rest, posed)) in enumerate(zip(guesses, crops, normals, strict=True)):
             moved = crop._replace(
                 rest=crop.rest._replace(vertices=crop.rest.vertices + step * at_rest),
                 posed=crop.posed._replace(vertices=crop.posed.vertices + step * posed),
             )
-            observed.append(_compare_rendered(guess, faces, moved))
-        vertices, gap, weight = _joined(observed)
-        if len(vertices) == 0:
+            vertices, gap, sure = _compare_rendered(guess, faces, moved)
+            target[k, vertices], weight[k, vertices] = outward[vertices] + gap, sure
+        # Sides of a slit that has closed are seen no more: without their targets it would open again.
+        known = weight.nonzero()
+        if len(known[1]) == 0:
             break
-        outward = sheet.solve(vertices, (outward[vertices] + gap)[:, None], weight)[:, 0]
+        outward = sheet.solve(known[1], target[known][:, None], weight[known])[:, 0]
     return torch.from_numpy(outward).to(like)[:, None] * normals[0][0]
 
 
