@@ -301,7 +301,7 @@ def _finish(
     if config.unseen == "painted":
         with stage("painting"):
             spacing = COARSE if config.size != "auto" and config.size <= COARSE_SIZE else SPACING
-            gaussians = cut_skin(hand, gaussians, close, spacing)
+            gaussians = cut_skin(hand, gaussians, close, adaptation.trusted.confidence.amax(0), spacing)
             painted = paint_unseen(hand, gaussians, adaptation.guess, first, adaptation.trusted, seed=config.seed)
             gaussians = painted.gaussians
     rest, lights = first.rest.vertices, adaptation.lights

@@ -9,6 +9,7 @@ from synthetic import crop_of
 from oasis_warp.adaptation.albedo_split import (
     ALBEDO_SHARE,
     DARKEST_FINE,
+    FINE_SHARE,
     MOST_HUE,
     mark_probability,
     split_albedo_shading,
@@ -81,7 +82,7 @@ def test_creases_stay(hand, albedo_scene):
     parted = split_albedo_shading(hand, guess.colors, guess._replace(colors=colors))
     before, after = (vertex_colors(guess._replace(colors=(c / guess.colors).log()), len(lines)) for c in
                      (colors, parted.colors))  # fmt: skip
-    assert 0.9 < float((before * after).sum() / before.square().sum()) < 1.05
+    assert 0.9 < float((before * after).sum() / before.square().sum()) / FINE_SHARE < 1.05
 
 
 def test_what_is_finer_than_the_vertices_stays(hand, albedo_scene):
@@ -132,7 +133,7 @@ def test_shade_leaves_no_line_where_what_the_photo_shows_ends(hand, albedo_scene
         parted = split_albedo_shading(hand, guess.colors, learned, seen=weights)
         return (parted.colors / guess.colors).log().mean(1)[(shown[:, 0] == 1) & (learned.colors > 0.03).all(1)]
 
-    assert float(left(seen.clamp_min(0.02)).min()) == pytest.approx(-0.3 * ALBEDO_SHARE, abs=0.03)
+    assert float(left(seen.clamp_min(0.02)).min()) == pytest.approx(-0.3 * ALBEDO_SHARE, abs=0.04)
     assert float(left(None).min()) < -0.15
 
 
@@ -146,6 +147,20 @@ def test_skin_that_gets_darker_up_to_where_the_photo_ends_keeps_no_dark_edge(han
     parted = split_albedo_shading(hand, guess.colors, learned, seen=seen.clamp_min(0.02))
     left = (parted.colors / guess.colors).log().mean(1)[(shown[:, 0] > 0.9) & (learned.colors > 0.03).all(1)]
     assert float(left.mean()) > -0.15  # -0.18 with a mean; ALBEDO_SHARE alone leaves -0.08
+
+
+def test_what_is_wide_leaves_the_albedo_where_the_photo_ends(hand, albedo_scene):
+    """Skin that the photo shows on a slant, in the shade, was a dark band with a ragged edge beside painted skin."""
+    guess, _ = albedo_scene
+    inside = ((hand.template[:, 0].median() - hand.template[:, 0]) / 0.02).clamp(0, 1)
+    seen = (inside > 0).float()
+    learned = guess._replace(colors=guess.colors * math.exp(-0.4))
+    parted = split_albedo_shading(hand, guess.colors, learned, seen, seen=seen.clamp_min(0.02))
+    left = (parted.colors / guess.colors).log().mean(1)
+    depth = vertex_to_gaussians(inside[:, None], hand.faces, guess)[:, 0]
+    at_end, open_skin = (left[part & (learned.colors > 0.03).all(1)] for part in (depth < 0.1, depth == 1))
+    assert float(open_skin.median()) == pytest.approx(-0.4 * ALBEDO_SHARE, abs=0.01)
+    assert float(at_end.min()) > -0.05  # -0.08 where it stays
 
 
 def test_nothing_stays_of_a_fold_too_dark_for_skin(hand, albedo_scene):

@@ -24,6 +24,10 @@ def fitted(hand):
     return crop, fine._replace(colors=(fine.colors * (0.6 + 0.7 * noise)).clamp(0, 1))
 
 
+def everywhere(hand):
+    return torch.ones(len(hand.template))
+
+
 def picture(hand, gaussians, crop):
     return render(pose_gaussians(gaussians, hand.faces, crop.rest.vertices, crop.posed.vertices), crop.camera)
 
@@ -31,9 +35,9 @@ def picture(hand, gaussians, crop):
 def test_cut_skin_keeps_the_photos_picture(hand, fitted, monkeypatch):
     """Averages of what was there blurred the detail of several photos."""
     crop, before = fitted
-    cut = cut_skin(hand, before, [crop])
-    monkeypatch.setattr("oasis_warp.adaptation.fine_skin.keep_pictures", lambda hand, before, cut, crops: cut.gaussians)
-    averaged = cut_skin(hand, before, [crop])
+    cut = cut_skin(hand, before, [crop], everywhere(hand))
+    monkeypatch.setattr("oasis_warp.adaptation.fine_skin.keep_pictures", lambda hand, before, cut, *_: cut.gaussians)
+    averaged = cut_skin(hand, before, [crop], everywhere(hand))
     shown, kept, blurred = (picture(hand, each, crop).image for each in (before, cut, averaged))
     inside = (inner_mask(crop.mask, 4) > 0.9).float()
     kept, blurred = (masked_psnr(each, shown, inside) for each in (kept, blurred))
@@ -43,7 +47,7 @@ def test_cut_skin_keeps_the_photos_picture(hand, fitted, monkeypatch):
 def test_no_part_stays_thick_or_half_transparent(hand, fitted):
     """They were so for the fit; turned, seen skin had blurred outlines beside painted skin."""
     crop, before = fitted
-    cut = cut_skin(hand, before, [crop])
+    cut = cut_skin(hand, before, [crop], everywhere(hand))
     inner = cut.opacities > 0.99 * SKIN.opacity  # without the fade at the wrist
     on_faces = torch.arange(len(inner)) >= len(cut.vertex_index)
     assert float((inner | ~on_faces).float().mean()) > 0.97
@@ -51,7 +55,7 @@ def test_no_part_stays_thick_or_half_transparent(hand, fitted):
     count = torch.bincount(cut.face_index, minlength=len(hand.faces))
     own = torch.bincount(before.face_index, minlength=len(hand.faces))
     assert bool((count[own > 0] >= own[own > 0]).all())
-    coarse = cut_skin(hand, before, [crop], COARSE)
+    coarse = cut_skin(hand, before, [crop], everywhere(hand), COARSE)
     same = torch.bincount(coarse.face_index, minlength=len(hand.faces)) == own
     assert float(same.float().mean()) > 0.95  # others are large
 
@@ -59,4 +63,4 @@ def test_no_part_stays_thick_or_half_transparent(hand, fitted):
 def test_a_small_photos_hand_without_faces_stays(hand, fitted):
     crop, before = fitted
     few: CanonicalGaussians = coarsen(hand, before._replace(shade=None), crop.rest)
-    assert cut_skin(hand, few, [crop]) is few
+    assert cut_skin(hand, few, [crop], everywhere(hand)) is few

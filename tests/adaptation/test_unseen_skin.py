@@ -32,7 +32,7 @@ def palm_photo(hand):
 
 def paint(hand, palm_photo, gaussians=None, seed=0, observations=None):
     crop, adapted = palm_photo
-    fine = cut_skin(hand, gaussians or adapted.gaussians, [crop])
+    fine = cut_skin(hand, gaussians or adapted.gaussians, [crop], adapted.trusted.confidence.amax(0))
     return paint_unseen(hand, fine, adapted.guess, crop, observations or adapted.observations, seed=seed)
 
 

@@ -19,15 +19,18 @@ from oasis_warp.core.types import CanonicalGaussians
 
 MIN_SHOWN = 1e-3
 """Least colour that comes out of colours and shade, which is a factor above 0."""
-ALBEDO_SHARE, FINE_SHARE = 0.2, 1.0
+ALBEDO_SHARE, FINE_SHARE = 0.2, 1.2
 """Share of a difference that is no mark which becomes albedo, and that of its fine part: creases, folds and the rims of
 nails stay on the skin, and light hardly changes so fast on it, but in sharp shadows beside outlines, which go before
-(`scraps`). Set by eye, as the two below; with .8 of the fine part, ten photos of same_hand keep .02 less of their
-contrast in other poses."""
+(`scraps`). Set by eye, as the three below. Fine skin is drawn fainter than it is, so there is more of it: with 1.0, ten
+photos keep .02 less of their contrast at 1-4 px on turned skin."""
 FINE_PASSES, FINE_PASSES_AT_WRIST = 60, 9
 """Smoothings over the mesh that leave the wide part, about 15 mm and 6 mm. With 9 everywhere, four photos of same_hand
 keep .65 of their contrast at 4-8 px in other poses, with 60 .72; but where the hand turns into the arm, wider folds are
 smears on a hand without its arm."""
+END_PASSES, LOCAL_PASSES = 18, 3
+"""Smoothings over the mesh of the end of what photos show, about 8 mm, and those that leave what is wide there, 3 mm.
+"""
 DARKEST_FINE, BRIGHTEST_FINE, MOST_HUE = 0.3, 0.15, 0.06
 """Largest fine part that is darker, that is brighter, and that differs between channels, as logarithms; more is a sharp
 shadow, gloss, or another part of the hand. With .3 for all, folds of a squeezed palm stayed as red gashes, and the
@@ -40,6 +43,8 @@ BESIDE_SHADOW, SOFT_SHADOW = 4, 3
 """Rings of vertices around such a shadow that go with it, and smoothings of its border."""
 FLAT = 0.004
 """Deviation of places [m] below which they do not tell a slope: across the skin, and on the width of a crease."""
+BRIGHT_AT_END = 0.3
+"""Share of the largest brighter part that is left where photos end: there it is the photo's background."""
 ACROSS_SHADING = ((-18.0, 21.3, -7.5), (8.8, 4.6, -8.1))
 """Shading moves the logarithms of skin colours along one line, from dark and red to bright and pale. These two
 directions are perpendicular to it, each divided by the standard deviation there, measured on photos of bare hands."""
@@ -76,14 +81,17 @@ def split_albedo_shading(
     trust, hand_share, seen = (
         torch.ones_like(no_mark[:, 0]) if share is None else share for share in (trust, hand_share, seen)
     )
+    openly = torch.maximum(seen_around(trust, edges), 1 - hand_share[:, None])
     wide = _wide_part(hand.template.to(guess.device), edges, of_vertices, seen, hand_share)
+    wide = torch.lerp(_local_mean(of_vertices, edges, seen), wide, openly)
     no_shadow = 1 - _shadow_of_pose(of_vertices, edges)
-    read = vertex_to_gaussians(torch.cat([wide, no_mark, no_shadow, trust[:, None]], 1), faces, learned)
-    wide, no_mark, no_shadow, trust = read.split([3, 1, 1, 1], 1)
-    fine = beyond - wide
+    read = vertex_to_gaussians(torch.cat([wide, no_mark, no_shadow, trust[:, None], openly], 1), faces, learned)
+    wide, no_mark, no_shadow, trust, openly = read.split([3, 1, 1, 1, 1], 1)
+    fine = FINE_SHARE * (beyond - wide)
     grey = fine.mean(1, keepdim=True)
-    fine = grey.clamp(-DARKEST_FINE, BRIGHTEST_FINE) + (fine - grey).clamp(-MOST_HUE, MOST_HUE)
-    skin = no_shadow * (ALBEDO_SHARE * beyond + (FINE_SHARE - ALBEDO_SHARE) * fine)
+    brightest = BRIGHTEST_FINE * (BRIGHT_AT_END + (1 - BRIGHT_AT_END) * openly)
+    fine = torch.minimum(grey.clamp_min(-DARKEST_FINE), brightest) + (fine - grey).clamp(-MOST_HUE, MOST_HUE)
+    skin = no_shadow * torch.lerp(fine, beyond, ALBEDO_SHARE * openly)
     albedo = trust * torch.lerp(beyond, skin, no_mark)
     colors = (guess.clamp_min(MIN_COLOR) * albedo.exp()).clamp(max=1)
     return learned._replace(colors=colors, shade=learned.colors.clamp_min(MIN_SHOWN) / colors)
@@ -110,6 +118,20 @@ def _wide_part(
         return (point[:, None].double() @ linear)[:, 0].to(beyond)
 
     return torch.lerp(at_vertices(narrow), at_vertices(wide), hand_share[:, None])
+
+
+def seen_around(seen: Float[Tensor, "V"], edges: Int[Tensor, "E 2"]) -> Float[Tensor, "V 1"]:
+    """1 where photos show all skin around, 0 where what they show ends."""
+    return (2 * surface.smooth_over_mesh(seen[:, None], edges, END_PASSES) - 1).clamp(0, 1)
+
+
+def _local_mean(
+    beyond: Float[Tensor, "V 3"], edges: Int[Tensor, "E 2"], seen: Float[Tensor, "V"]
+) -> Float[Tensor, "V 3"]:
+    """Mean of a difference at and beside each vertex, of what photos show."""
+    weighted = torch.cat([seen[:, None] * beyond, seen[:, None]], 1)
+    total, weight = surface.smooth_over_mesh(weighted, edges, LOCAL_PASSES).split([3, 1], 1)
+    return total / weight
 
 
 def _shadow_of_pose(beyond: Float[Tensor, "V 3"], edges: Int[Tensor, "E 2"]) -> Float[Tensor, "V 1"]:

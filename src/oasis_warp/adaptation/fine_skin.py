@@ -3,9 +3,13 @@
 from collections.abc import Sequence
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
+from oasis_warp.adaptation.albedo_split import seen_around
 from oasis_warp.adaptation.photo_view import keep_pictures
 from oasis_warp.avatar.densify import SKIN, densify, parts_for_spacing
+from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, HandCrop
 
@@ -16,7 +20,8 @@ And the same where pictures of 256 px of an open hand are all that is wanted: fa
 
 @torch.no_grad()
 def cut_skin(
-    hand: HandModel, gaussians: CanonicalGaussians, crops: Sequence[HandCrop], spacing: float = SPACING
+    hand: HandModel, gaussians: CanonicalGaussians, crops: Sequence[HandCrop], seen: Float[Tensor, "V"],
+    spacing: float = SPACING,
 ) -> CanonicalGaussians:
     """Cut faces into parts with thin, opaque Gaussians, which show the photos' cameras what they saw before.
 
@@ -27,6 +32,7 @@ def cut_skin(
         hand: Model of the surface.
         gaussians: Fitted to the photos, with the same number of parts along each edge of a face.
         crops: K photos, with one surface at rest.
+        seen: How well they show the skin of each vertex, 0 to 1.
         spacing: Side of the squares that are as large as the parts are at most [m].
     """
     rest = crops[0].rest.vertices
@@ -34,4 +40,5 @@ def cut_skin(
     there = torch.bincount(gaussians.face_index, minlength=len(faces)).double().sqrt().round().long()
     parts = torch.where(there > 0, torch.maximum(there, parts_for_spacing(rest, faces, spacing)), 1)
     cut = densify(gaussians, rest, faces, parts, SKIN)
-    return keep_pictures(hand, gaussians, cut, crops) if cut.n_new else gaussians
+    openly = seen_around(seen, surface.mesh_edges(faces))
+    return keep_pictures(hand, gaussians, cut, crops, openly) if cut.n_new else gaussians

@@ -83,8 +83,9 @@ def match_photos(
 
 @torch.no_grad()
 def keep_pictures(
-    hand: HandModel, before: CanonicalGaussians, after: Densified, crops: Sequence[HandCrop]
-) -> CanonicalGaussians:
+    hand: HandModel, before: CanonicalGaussians, after: Densified, crops: Sequence[HandCrop],
+    openly: Float[Tensor, "V 1"],
+) -> CanonicalGaussians:  # fmt: skip
     """The finer Gaussians `after`, with the new ones in such colours that photos' cameras see what they saw `before`.
 
     Fine Gaussians have the averages of those that were there, which blurs what the photos show.
@@ -94,6 +95,8 @@ def keep_pictures(
         before: Fitted to the photos.
         after: The same with finer ones.
         crops: K photos, with one surface at rest.
+        openly: How far colours change; the rest is shade, if there is any. Where the photos end both change fast, and
+            the colours got pale specks.
     """
     faces, views, made = hand.faces.to(crops[0].image.device), [], after.gaussians
     old, new = with_shade_baked(before), with_shade_baked(made)
@@ -105,7 +108,9 @@ def keep_pictures(
         views.append(_View(weights, new.colors, goal, (alpha > MIN_ALPHA).to(alpha)))
     logs = _missing(views, HARDLY_SEEN).clamp(-MOST_KEPT, MOST_KEPT)
     logs[: len(logs) - after.n_new] = 0
-    return made._replace(colors=(made.colors * logs.exp()).clamp(0, 1))
+    share = vertex_to_gaussians(openly, faces, made) if made.shade is not None else 1
+    changed = made._replace(colors=(made.colors * (share * logs).exp()).clamp(0, 1))
+    return changed if made.shade is None else changed._replace(shade=made.shade * ((1 - share) * logs).exp())
 
 
 def _missing(views: Sequence[_View], least: float) -> Float[Tensor, "N 3"]:

@@ -131,6 +131,6 @@ def reconstructions(
             if ONE_SHOT in stages:
                 yield Method(name, ONE_SHOT), LitGaussians(adapted.gaussians, adapted.light)
             if PAINTED in stages:
-                fine = cut_skin(hand, adapted.gaussians, [crop])
+                fine = cut_skin(hand, adapted.gaussians, [crop], adapted.trusted.confidence.amax(0))
                 painted = paint_unseen(hand, fine, adapted.guess, crop, adapted.trusted, seed=config.seed)
                 yield Method(name, PAINTED), LitGaussians(painted.gaussians, adapted.light)
