@@ -15,9 +15,9 @@ from oasis_warp.avatar.sky import NOTHING_HIDDEN
 from oasis_warp.avatar.vertex_light import (
     GAMMA,
     SurfaceLight,
+    eye_from,
     mirror_surface_light,
-    view_direction,
-    view_share,
+    view_shares,
     with_photo,
     with_todays_light,
 )
@@ -253,12 +253,16 @@ class Avatar:
         return orbit_camera(vertices, azimuth, elevation, size, up=hand_up(self.hand, vertices))
 
     @torch.no_grad()
-    def shade_share(self, vertices: Float[Tensor, "V 3"], camera: Camera) -> float:
-        """Share of the photo's shade in a picture of the posed `vertices` by `camera`; all colours else are alike."""
-        if self._light is None or self._light.photo_view is None:
-            return 1.0
-        center = camera_center(camera.viewmat.to(vertices))
-        return float(view_share(self._light.photo_view, view_direction(vertices, center)))
+    def shade_shares(self, vertices: Float[Tensor, "V 3"], camera: Camera) -> tuple[float, float]:
+        """Shares of the photo's shade in a picture of the posed `vertices` by `camera`; all colours else are alike.
+
+        The first is that of any shade; the second that of the Gaussians', times the first, where the photo is in doubt.
+        """
+        if self._light is None or self._light.photo_eye is None:
+            return 1.0, 1.0
+        eye = eye_from(vertices, camera_center(camera.viewmat.to(vertices)))
+        anywhere, in_doubt = view_shares(self._light.photo_eye, eye).tolist()
+        return anywhere, in_doubt
 
     def render(
         self, camera: Camera, pose: HandPose | str, background: Color = WHITE, *, validate: bool = True

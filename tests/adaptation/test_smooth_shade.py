@@ -81,6 +81,25 @@ def test_the_photo_view_stays_and_fine_shade_with_the_gaussians(hand, scene):
     assert float(torch.corrcoef(torch.stack([left, fine]))[0, 1]) > 0.8 and float(left.std()) < 0.08
 
 
+def test_where_the_photo_is_in_doubt_the_light_gets_what_continues_the_skin_around(hand, scene):
+    """A thumb's edge on the palm behind it was light, and stayed there from other sides."""
+    crop, truth, pose, light, seen = scene
+    place = hand.template[:, 0]
+    doubted = (place < place[shown_in(seen)].quantile(0.3)).float()
+    wrong = -0.7 * doubted * torch.sin(600 * place).sign()
+    log_shade = torch.where(shown_in(seen), wrong - 0.1, 0.0)[:, None].expand(-1, 3)
+    light = light._replace(doubt=doubted)
+    before = shaded(hand, truth, log_shade)
+    after, spread = spread_shade(hand, before, crop, light)
+    drawn = [
+        avatar_of(hand, g, pose, crop.camera, own).render(crop.camera, pose).image
+        for g, own in ((before, light), (after, spread))
+    ]
+    assert float((drawn[1] - drawn[0]).abs().quantile(0.99)) < 2 / 255
+    there = (doubted > 0) & (seen.confidence > 0.9)
+    assert float(spread.shade[there].log().min()) > -0.15  # -0.7 with what the photo shows there
+
+
 def test_in_another_pose_no_part_of_the_hand_keeps_smooth_shade(hand, scene):
     """A palm kept its shade beside fingers that lost it as they turned: two tones with an edge."""
     crop, truth, pose, light, _ = scene

@@ -35,12 +35,13 @@ def pages(left_hand, right_hand):
 
 @pytest.fixture
 def shaded(avatar):
-    """The same with a shade that only the photo's side sees."""
+    """The same with a shade that only the photo's side sees, in doubt on some skin."""
     light, gaussians = avatar.light, avatar.gaussians
     facing = surface.vertex_normals(avatar._photo_surface(), avatar.hand.faces)
     shade = torch.linspace(0.4, 1.5, len(facing))[:, None].expand(-1, 3)
     own = torch.linspace(0.5, 1.3, len(gaussians.colors))[:, None].expand(-1, 3)
-    return avatar.with_looks(gaussians._replace(shade=own), light._replace(shade=shade, facing=facing))
+    doubt = (torch.arange(len(facing)) % 3) / 2
+    return avatar.with_looks(gaussians._replace(shade=own), light._replace(shade=shade, facing=facing, doubt=doubt))
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -29,6 +29,7 @@ NODE = shutil.which("node")
     ("file", "name", "value"),
     [
         ("shading.js", "GAMMA", vertex_light.GAMMA),
+        ("shading.js", "HALF_HAND", vertex_light.HALF_HAND),
         ("shading.js", "SAME_POSE", vertex_light.SAME_POSE),
         ("shading.js", "OTHER_POSE", vertex_light.OTHER_POSE),
         ("shading.js", "SAME_SKY", vertex_light.SAME_SKY),
@@ -130,7 +131,7 @@ def test_the_pages_script_poses_and_lights_as_python_does(avatar, pages, tmp_pat
 @pytest.mark.slow
 @pytest.mark.skipif(NODE is None, reason="needs node")
 def test_the_pages_script_fades_shade_as_python_does_when_the_camera_leaves(shaded, tmp_path):
-    jobs = [{"pose": "photo", "look": "photo", "azimuth": angle} for angle in (0.0, 0.35, -0.5, 1.0, 0.35)]
+    jobs = [{"pose": "photo", "look": "photo", "azimuth": angle} for angle in (0.0, 0.35, -0.5, 1.0, 0.35, 0.08)]
     run_script(page_html(shaded, "A hand"), jobs, tmp_path)
     colors = []
     for k, job in enumerate(jobs):

@@ -28,7 +28,7 @@ def scene(hand, device):
     on = Lighting(torch.stack([facing, near, far]), exposure, torch.rand(3, n, generator=random))
     seen = (exposure[1, :, 0] - 0.2 * torch.rand(n, generator=random)).clamp_min(0)
     seen[::2] = 1
-    viewed = torch.tensor([1.0, 0.6, 0.0])
+    viewed = torch.tensor([[1.0, 0.3], [0.6, 0.0], [0.0, 1.0]])
     there = HandLight(*(None if part is None else part.to(device) for part in light))
     on = Lighting(*(None if part is None else part.to(device) for part in on))
     return there, on, seen.to(device), viewed.to(device)

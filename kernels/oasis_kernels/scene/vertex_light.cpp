@@ -79,12 +79,16 @@ void light_vertices(
                     const V own = more_sky(even, get(seen + i, count)), doubtful = doubt ? get(doubt + i, count) : zero;
                     under_sky(own, get(around, count), doubtful, &deep, &weak);
                 }
-                if (viewed) deep *= viewed[b], weak *= viewed[b];
+                if (viewed) deep *= viewed[2 * b], weak *= viewed[2 * b];
                 if (shade) {
                     const V3 s = get3(shade + 3ll * i, count);
                     const V by[3] = {s.x, s.y, s.z};
                     for (int c = 0; c < 3; c++) color[c] *= 1.f + deep * (by[c] - 1.f);
                     weak = beside_deep(deep, weak, s.x, s.y, s.z);
+                }
+                if (viewed && doubt) {
+                    const V left = 1.f - get(doubt + i, count) * (1.f - viewed[2 * b + 1]);
+                    deep *= left, weak *= left;
                 }
             }
             float columns[5][16];

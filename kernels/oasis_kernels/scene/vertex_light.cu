@@ -63,9 +63,13 @@ __global__ void light_vertices(
                 near += weights[3 * v + k] * opened[(long long)b * n_coarse + corners[3 * v + k]];
             under_sky(more_sky(exposure[4 * at], seen[v]), near, doubt ? doubt[v] : 0.f, &deep, &weak);
         }
-        if (viewed) deep *= viewed[b], weak *= viewed[b];
+        if (viewed) deep *= viewed[2 * b], weak *= viewed[2 * b];
         for (int c = 0; shade && c < 3; c++) color[c] *= 1.f + deep * (shade[3 * v + c] - 1.f);
         if (shade) weak = beside_deep(deep, weak, shade[3 * v], shade[3 * v + 1], shade[3 * v + 2]);
+        if (viewed && doubt) {
+            const float left = 1.f - doubt[v] * (1.f - viewed[2 * b + 1]);
+            deep *= left, weak *= left;
+        }
     }
     for (int c = 0; c < 3; c++) out[5 * at + c] = color[c];
     out[5 * at + 3] = deep;

@@ -52,8 +52,12 @@ MARK_DISTANCES = 3.5, 7.0
 """Distances from that line, in standard deviations, at which a difference begins to count as a mark and at which it
 surely is one. 98 % of the vertices of bare skin are below the first; half-transparent ink has 5, ink 15, polish 24."""
 SHADOW_SLOPE = 0.6
-"""By how much those distances grow for each unit by which a difference is dark and redder than the line: deep between
-fingers light has come through skin. Set on a shadow beside a thumb in one photo of same_hand; ink is not redder."""
+"""By how much those distances grow for each unit by which a difference is dark and redder or yellower than the line:
+deep between fingers light has come through skin, and cameras lose blue first. Set on a shadow beside a thumb in one
+photo of same_hand; ink is bluer."""
+CRUSHED = 0.05
+"""What is added to sRGB colours before marks are told by their ratio: that of channels that are next to black tells
+nothing. In one photo the shadow between two tendons had no blue, and was a brown burn in every pose."""
 MARK_BRIGHTNESSES = 0.45, 0.7
 """The same for the mean of the logarithms, for bright marks: 99 % of bare skin is below the first."""
 
@@ -76,7 +80,9 @@ def split_albedo_shading(
     ratio = learned.colors.clamp_min(MIN_COLOR) / guess.clamp_min(MIN_COLOR)
     beyond = ratio.log().clamp(-MAX_LOG_SHADE, MAX_LOG_SHADE)
     of_vertices = vertex_colors(learned._replace(colors=beyond), len(hand.template))
-    faces, no_mark = hand.faces.to(guess.device), 1 - mark_probability(of_vertices)
+    told = ((learned.colors + CRUSHED) / (guess + CRUSHED)).log().clamp(-MAX_LOG_SHADE, MAX_LOG_SHADE)
+    no_mark = 1 - mark_probability(vertex_colors(learned._replace(colors=told), len(hand.template)))
+    faces = hand.faces.to(guess.device)
     edges = surface.mesh_edges(faces)
     trust, hand_share, seen = (
         torch.ones_like(no_mark[:, 0]) if share is None else share for share in (trust, hand_share, seen)
@@ -146,7 +152,8 @@ def _shadow_of_pose(beyond: Float[Tensor, "V 3"], edges: Int[Tensor, "E 2"]) -> 
 def mark_probability(beyond: Float[Tensor, "V 3"]) -> Float[Tensor, "V 1"]:
     """Probability that a difference of the logarithms of colours is a mark on the skin and not light."""
     across, bright = beyond @ beyond.new_tensor(ACROSS_SHADING).T, beyond.mean(-1)
-    wider = torch.where(across[..., 0] < 0, 1 + SHADOW_SLOPE * (-bright).clamp_min(0), 1)
+    as_in_shadow = (across[..., 0] < 0) | (across[..., 1] > 0)
+    wider = torch.where(as_in_shadow, 1 + SHADOW_SLOPE * (-bright).clamp_min(0), 1)
     likely = [
         ((measure - low) / (high - low)).clamp(0, 1)
         for measure, (low, high) in ((across.norm(dim=-1) / wider, MARK_DISTANCES), (bright, MARK_BRIGHTNESSES))

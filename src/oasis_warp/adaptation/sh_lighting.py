@@ -9,6 +9,7 @@ from oasis_warp.avatar.anchors import rim_fade, vertex_to_gaussians
 from oasis_warp.avatar.observation import Observation, observe
 from oasis_warp.avatar.sky import arriving, harmonic_basis
 from oasis_warp.avatar.vertex_light import GAMMA, Lighting, posed_lighting, shading
+from oasis_warp.core import surface
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandLight
 from oasis_warp.core.windows import mean_around
@@ -55,6 +56,9 @@ WHITE_QUANTILE = 0.995
 """Quantile of unlit skin colours that is scaled to 1 where it exceeds it."""
 MAX_LOG_SHADE = 3.0
 """Largest absolute logarithm of shade."""
+DOUBT_PASSES = 12
+"""Smoothings over the mesh, about 7 mm, of where the photo may show another part of the hand, and of as much beside it.
+With a sharp border shadows had ragged edges where the view had changed by a few degrees."""
 OCCLUDER_FADE = 0.001
 """Distance over which the shade of pixels that may not show the skin ends [m]."""
 MIN_COLOR = 0.02
@@ -186,7 +190,9 @@ def add_shade(
     doubt = (seen.confidence - reliable * exposure_confidence(on)) * fade
     occluded = inpaint(rest, faces, missing, doubt, OCCLUDER_FADE / 3, OCCLUDER_FADE)
     shade = occluded.clamp(-MAX_LOG_SHADE, MAX_LOG_SHADE).exp()
-    return light._replace(shade=shade, facing=on.normals, doubt=1 - _reliable_share(seen.confidence, reliable))
+    elsewhere = 1 - _reliable_share(seen.confidence, reliable)[:, None]
+    around = 2 * surface.smooth_over_mesh(elsewhere, surface.mesh_edges(faces), DOUBT_PASSES)
+    return light._replace(shade=shade, facing=on.normals, doubt=around.clamp(max=1)[:, 0])
 
 
 def shading_picture(hand: HandModel, crop: HandCrop, light: HandLight) -> Float[Tensor, "H W 3"]:

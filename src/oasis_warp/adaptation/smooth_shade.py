@@ -36,7 +36,9 @@ def spread_shade(
     The albedo that is fitted to a photo hardly varies over more than a centimetre, but the shade does. It ended where
     the photo does, which was an edge between two tones from the side. In other poses it stayed on a palm and went from
     the fingers. The shade of the light ends on the whole hand at once (`avatar.vertex_light.remaining_shade`), and that
-    of the Gaussians where skin turns. The photo's view stays.
+    of the Gaussians where skin turns. Where the photo may show another part of the hand, the light gets what continues
+    the skin around; all that the photo shows beyond that stays with the Gaussians, and ends in next to any other view.
+    The photo's view stays.
 
     Args:
         hand: Model of the surface.
@@ -52,11 +54,14 @@ def spread_shade(
     grey = total.mean(-1, keepdim=True)
     likely = grey.clamp(DARKEST, BRIGHTEST) + (total - grey).clamp(-MAX_HUE, MAX_HUE)
     shown = seen.visibility * (seen.facing > 0)
-    smooth = inpaint(rest, faces, likely, torch.maximum(seen.confidence, RIM_WEIGHT * shown), SMOOTH, REACH)
+    doubt = shown.new_zeros(1) if light.doubt is None else light.doubt
+    sure = torch.maximum(seen.confidence, RIM_WEIGHT * shown) * (1 - doubt)
+    smooth = inpaint(rest, faces, likely, sure, SMOOTH, REACH)
     hidden = 1 - shown[:, None]
     hidden = torch.minimum(surface.smooth_over_mesh(hidden, surface.mesh_edges(faces), BEHIND_PASSES), hidden)
     fine = MAX_FINE * torch.tanh((total - smooth) / MAX_FINE)
-    moved = light.shade * ((1 - hidden) * (own - fine).clamp(-MAX_MOVED, MAX_MOVED)).exp()
+    to_light = torch.lerp((own - fine).clamp(-MAX_MOVED, MAX_MOVED), smooth - light.shade.log(), doubt[:, None])
+    moved = light.shade * ((1 - hidden) * to_light).exp()
     # Not exp(moved) itself: light is read between vertices as a factor, and the photo's view must not change.
     lit = shading(light, posed_lighting(rest, crop.posed.vertices, faces, light))
     before, after = vertex_to_gaussians(torch.cat([lit * light.shade, lit * moved], 1), faces, gaussians).split(3, 1)

@@ -15,11 +15,11 @@ from oasis_warp.avatar.vertex_light import (
     WEAK,
     Lighting,
     SurfaceLight,
+    eye_from,
     kernels_take,
     lighting,
     vertex_light,
-    view_direction,
-    view_share,
+    view_shares,
 )
 from oasis_warp.core.types import CanonicalGaussians, Gaussians, HandLight
 from oasis_warp.ops import RestMesh, pose_mesh_gaussians
@@ -32,6 +32,9 @@ shadow that is a pixel off, skin would be white where that shadow goes."""
 MOST_DETAIL = 0.5
 """Largest difference of the logarithms of colours by which detail changes the skin. Gaussians finer than the photo's
 shadows overshoot where a shadow ends: one spot of skin was black. The rest is shade of the photo."""
+IN_SHADOW = 0.5, 0.8
+"""How dark shade is, as the mean of logarithms, from which less detail in it is skin, and from which none is. It was
+orange flecks on one back, in a shadow in which the camera had lost the blue."""
 MIN_COLOR = 1e-3
 """Least colour that has shade: it is a factor."""
 
@@ -155,7 +158,8 @@ def with_photo_colors(
     """The same, with the colours that the photo shows of some Gaussians, in the shade that these have.
 
     A share `trust` of the change becomes colour, all of it if not given; the rest becomes shade. With `trust`, a change
-    that only undoes the present shade does not become colour either, nor does more than `MOST_DETAIL`.
+    that only undoes the present shade does not become colour either, nor does one in a shadow, nor more than
+    `MOST_DETAIL`.
     """
     if canonical.shade is None:
         return canonical._replace(colors=canonical.colors.masked_scatter(changed[:, None], shown))
@@ -164,7 +168,9 @@ def with_photo_colors(
         news = (shown.clamp_min(MIN_COLOR) / (canonical.colors[changed] * shade).clamp_min(MIN_COLOR)).log()
         most = -shade.log()
         back = (news - news.clamp(-MAX_DETAIL, MAX_DETAIL)).clamp(most.clamp(max=0), most.clamp(min=0))
-        shade = shade * (news - (trust * (news - back)).clamp(-MOST_DETAIL, MOST_DETAIL)).exp()
+        light, dark = IN_SHADOW
+        lit = ((shade.log().mean(1, keepdim=True) + dark) / (dark - light)).clamp(0, 1)
+        shade = shade * (news - (lit * trust * (news - back)).clamp(-MOST_DETAIL, MOST_DETAIL)).exp()
     colors, shade = split_shade(shown, shade)
     return canonical._replace(
         colors=canonical.colors.masked_scatter(changed[:, None], colors),
@@ -203,8 +209,8 @@ def pose_gaussians(
     if light is not None and vertex_quats is not None:
         on = lighting(posed_vertices, vertex_quats, light.normals, light.light, closeness)
         viewed = None
-        if center is not None and light.photo_view is not None:
-            viewed = view_share(light.photo_view, view_direction(posed_vertices, center))
+        if center is not None and light.photo_eye is not None:
+            viewed = view_shares(light.photo_eye, eye_from(posed_vertices, center))
         of_vertices = vertex_light(light.light, on, light.seen, viewed)
         corners = light.corners or gaussian_corners(faces, canonical)
         colors = lit(canonical, of_vertices, corners, bend, posed_vertices)

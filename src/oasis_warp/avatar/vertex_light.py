@@ -40,6 +40,10 @@ SAME_VIEW, OTHER_VIEW = math.cos(math.radians(10)), math.cos(math.radians(35))
 """Cosines of the angle between the directions from which photo and picture see the hand, up to which shade stays and
 from which it is gone: seen from another side, what a photo shows on a slant, in gloss or a pixel off is a stain. Chosen
 on 24 hands of same_hand from 45 degrees on, as docs/looks.md says."""
+HALF_HAND, SAME_PARALLAX, OTHER_PARALLAX = 0.08, math.radians(2), math.radians(7)
+"""Half the width of a hand [m]; angles by which picture and photo see its halves from another side, up to which the
+Gaussians' shade stays and from which it is gone where the photo may show another part of the hand: beside outlines the
+fit is off by some pixels, and what lay behind a thumb had the thumb's edge. Set by eye on 4 hands of docs/looks.md."""
 MIN_LIGHT = 1e-6
 """Least share of the light that shade makes up for: deep in a fist hardly any arrives."""
 _RULES = Rules(
@@ -56,8 +60,8 @@ class SurfaceLight(NamedTuple):
     """Unit normals of the surface at rest."""
     seen: Float[Tensor, "V"] | None = None
     """Share of the sky that each vertex saw in the photo; None where no shade depends on it."""
-    photo_view: Float[Tensor, "3"] | None = None
-    """Unit direction from the middle of the hand to the photo's camera; None where the view changes no colour."""
+    photo_eye: Float[Tensor, "3"] | None = None
+    """From the middle of the hand to the photo's camera [m]; None where the view changes no colour."""
     corners: Corners | None = None
     """Of the surface's Gaussians, if they are known."""
 
@@ -75,8 +79,8 @@ class Lighting(NamedTuple):
 
 def mirror_surface_light(light: SurfaceLight) -> SurfaceLight:
     """The same in the mirrored world."""
-    view = None if light.photo_view is None else mirror_points(light.photo_view)
-    return light._replace(light=mirror_light(light.light), normals=mirror_points(light.normals), photo_view=view)
+    eye = None if light.photo_eye is None else mirror_points(light.photo_eye)
+    return light._replace(light=mirror_light(light.light), normals=mirror_points(light.normals), photo_eye=eye)
 
 
 def posed_lighting(
@@ -110,19 +114,27 @@ def with_photo(
 
     With the `center` of the photo's camera, for pictures from other sides.
     """
-    view = None if center is None or light.facing is None else view_direction(photo, center)
+    eye = None if center is None or light.facing is None else eye_from(photo, center)
     seen = None if light.shade is None else posed_lighting(rest, photo, faces, light).exposure
-    return SurfaceLight(light, surface.vertex_normals(rest, faces), None if seen is None else seen[..., 0], view)
+    return SurfaceLight(light, surface.vertex_normals(rest, faces), None if seen is None else seen[..., 0], eye)
 
 
-def view_direction(vertices: Float[Tensor, "*B V 3"], center: Float[Tensor, "3"]) -> Float[Tensor, "*B 3"]:
-    """Unit direction from the middle of the posed hand to a camera at `center`."""
-    return torch.nn.functional.normalize(center - vertices.mean(-2), dim=-1)
+def eye_from(vertices: Float[Tensor, "*B V 3"], center: Float[Tensor, "3"]) -> Float[Tensor, "*B 3"]:
+    """From the middle of the posed hand to a camera at `center`."""
+    return center - vertices.mean(-2)
 
 
-def view_share(photo_view: Float[Tensor, "3"], view: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B"]:
-    """Share of the photo's shade that stays in a picture of the hand from this direction."""
-    return (((photo_view * view).sum(-1) - OTHER_VIEW) / (SAME_VIEW - OTHER_VIEW)).clamp(0, 1)
+def view_shares(photo_eye: Float[Tensor, "3"], eye: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 2"]:
+    """Shares of the photo's shade that stay in a picture of the hand from there: anywhere, and where it is in doubt.
+
+    Where it is in doubt, a camera that is nearer than the photo's is elsewhere, too.
+    """
+    nearness = [1 / place.norm(dim=-1, keepdim=True) for place in (photo_eye, eye)]
+    before, now = (place * near for place, near in zip((photo_eye, eye), nearness, strict=True))
+    turned = (before - now).square().sum(-1) + (HALF_HAND * (nearness[0] - nearness[1])).square()[..., 0]
+    wide = ((before * now).sum(-1) - OTHER_VIEW) / (SAME_VIEW - OTHER_VIEW)
+    close = (OTHER_PARALLAX**2 - turned) / (OTHER_PARALLAX**2 - SAME_PARALLAX**2)
+    return torch.stack([wide, close], -1).clamp(0, 1)
 
 
 def with_todays_light(
@@ -182,7 +194,7 @@ def remaining_shade(light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | N
 
 
 def vertex_light(
-    light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | None = None, viewed: Float[Tensor, "*B"] | None = None
+    light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | None = None, viewed: Float[Tensor, "*B 2"] | None = None
 ) -> Float[Tensor, "*B V 5"]:
     """`vertex_light_in_steps`, in one kernel where no gradient is asked."""
     if kernels_take(on.normals, light.harmonics, light.limits):
@@ -198,30 +210,32 @@ def kernels_take(*tensors: Tensor | None) -> bool:
 
 
 def vertex_light_in_steps(
-    light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | None = None, viewed: Float[Tensor, "*B"] | None = None
+    light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | None = None, viewed: Float[Tensor, "*B 2"] | None = None
 ) -> Float[Tensor, "*B V 5"]:
     """Factors of the sRGB colours of vertices, then the shares of deep and of weak shade that stay, 0 without any.
 
-    `shading`, with the shade of the light, which is smooth or of pixels beside outlines; then `remaining_shade` times
-    `viewed`. Where the shade of the light is deep, weak shade goes with it: in a shadow photos show little but noise,
-    which was a bright scab without the shadow.
+    `shading`, with the shade of the light, which is smooth; then `remaining_shade` times the first of `view_shares`,
+    and where the photo is in doubt times the second. Where the shade of the light is deep, weak shade goes with it: in
+    a shadow photos show little but noise, which was a bright scab without the shadow.
     """
     of_vertices = shading(light, on)
     if light.facing is None:
         return torch.cat([of_vertices, torch.zeros_like(of_vertices[..., :2])], -1)
     stays = remaining_shade(light, on, seen)
     if viewed is not None:
-        stays = stays * viewed[..., None, None]
-    if light.shade is None:
-        return torch.cat([of_vertices, stays], -1)
-    of_vertices = of_vertices * (1 + stays[..., :1] * (light.shade - 1))
-    deep, weak = stays.split(1, -1)
-    of_deep = (((light.shade - 1).abs().amax(-1, keepdim=True) - WEAK) / (DEEP - WEAK)).clamp(0, 1)
-    return torch.cat([of_vertices, deep, torch.lerp(weak, torch.minimum(weak, deep), of_deep)], -1)
+        stays = stays * viewed[..., None, :1]
+    if light.shade is not None:
+        of_vertices = of_vertices * (1 + stays[..., :1] * (light.shade - 1))
+        deep, weak = stays.split(1, -1)
+        of_deep = (((light.shade - 1).abs().amax(-1, keepdim=True) - WEAK) / (DEEP - WEAK)).clamp(0, 1)
+        stays = torch.cat([deep, torch.lerp(weak, torch.minimum(weak, deep), of_deep)], -1)
+    if viewed is not None and light.doubt is not None:
+        stays = stays * (1 - light.doubt[:, None] * (1 - viewed[..., None, 1:]))
+    return torch.cat([of_vertices, stays], -1)
 
 
 def _vertex_light_at_once(
-    light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | None, viewed: Float[Tensor, "*B"] | None
+    light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | None, viewed: Float[Tensor, "*B 2"] | None
 ) -> Float[Tensor, "*B V 5"]:
     batch, mesh = on.normals.shape[:-2], sky.sky_mesh(on.normals.device)
     in_sky = on.exposure is not None and light.albedo is not None
@@ -235,7 +249,7 @@ def _vertex_light_at_once(
     found = light_vertices(
         on.normals.reshape(-1, *on.normals.shape[-2:]), light.harmonics, light.limits, _RULES,
         Coarse(mesh.vertices, mesh.nearby, mesh.corners), flat(on.exposure), light.albedo, flat(on.closeness), photo,
-        None if viewed is None else viewed.expand(batch).reshape(-1),
+        None if viewed is None else viewed.expand(*batch, 2).reshape(-1, 2),
     )  # fmt: skip
     return found.view(*batch, *found.shape[1:])
 

@@ -78,7 +78,7 @@ def _pose(avatar: Avatar, pose: HandPose, camera: Camera, last: _Posed | None = 
     if last.camera is camera:
         return last
     vertices = avatar.mesh(pose).vertices if last.vertices is None else last.vertices
-    same = avatar.shade_share(vertices, camera) == avatar.shade_share(vertices, last.camera)
+    same = avatar.shade_shares(vertices, camera) == avatar.shade_shares(vertices, last.camera)
     return _Posed(pose, camera, last.gaussians if same else avatar.pose(pose, camera=camera), vertices)
 
 

@@ -93,7 +93,7 @@ def page_facts(
         "joints": joint_sliders(parts.hand),
         "lights": {name: _light_facts(light) for name, light in lights.items()},
         "folds": {"straight": _flat(folds.straight), "photo": _flat(folds.photo)},
-        "photoView": None if studio.photo_view is None else _flat(studio.photo_view),
+        "photoEye": None if studio.photo_eye is None else _flat(studio.photo_eye),
         "still": sky_mesh(torch.device("cpu")).still,
         "orbitMargin": ORBIT_MARGIN,
         "fieldOfView": ORBIT_FIELD_OF_VIEW,

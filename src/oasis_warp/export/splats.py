@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from numpy.polynomial import Chebyshev, Polynomial, legendre
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from oasis_warp.core import rotation
 from oasis_warp.core.errors import InputError
@@ -45,20 +46,20 @@ DEGREE = 3
 def view_harmonics(request: ExportRequest) -> Float[Tensor, "N K 3"] | None:
     """Spherical harmonics of the colours of `posed_splats`, in axes of `y_down`; None where no view changes them.
 
-    From the photo's side they have the photo's shade, from others they have not (`avatar.vertex_light.view_share`).
+    From the photo's side they have the photo's shade, from others they have not (`avatar.vertex_light.view_shares`).
     The share is the polynomial of degree 3 of the cosine with the narrowest lobe (Dolph and Chebyshev): 1 at the
     photo's side, a half at 32 degrees, and at most `SIDE_LOBES` from 48 degrees on.
     """
     avatar, light, pose = request.avatar, request.avatar.parts.light, request.pose or request.avatar.source_pose
-    if request.light == "none" or light is None or light.photo_view is None:
+    if request.light == "none" or light is None or light.photo_eye is None:
         return None
-    axes, middle = torch.eye(4).to(light.photo_view), avatar.mesh(pose).vertices.mean(0)
-    axes[:3, 3] = light.photo_view - middle  # a camera behind the hand, from where only its place matters
+    axes, middle = torch.eye(4).to(light.photo_eye), avatar.mesh(pose).vertices.mean(0)
+    axes[:3, 3] = light.photo_eye - middle  # a camera behind the hand, from where only its place matters
     near, far = avatar.pose(pose).colors, avatar.pose(pose, camera=avatar.source_camera._replace(viewmat=axes)).colors
     if torch.equal(near, far):
         return None
     y_down_axes = torch.diag(axes.new_tensor(HALF_TURN)) @ photo_axes(avatar.source_camera).to(axes)
-    toward = -(y_down_axes @ light.photo_view)  # harmonics are of the direction from the camera
+    toward = -(y_down_axes @ normalize(light.photo_eye, dim=0))  # harmonics are of the direction from the camera
     count = (DEGREE + 1) ** 2
     basis = spherical_harmonics(DEGREE, toward.expand(count, 3), torch.eye(count).to(axes)[..., None].expand(-1, -1, 3))
     degrees = torch.arange(count).float().sqrt().floor().long()

@@ -72,7 +72,7 @@ def light_vertices(
     albedo: Float[Tensor, "3"] | None = None,
     closeness: Float[Tensor, "B V"] | None = None,
     photo: InPhoto | None = None,
-    viewed: Float[Tensor, "B"] | None = None,
+    viewed: Float[Tensor, "B 2"] | None = None,
 ) -> Float[Tensor, "B V 5"]:
     """Factors of the vertices' sRGB colours, then the shares of deep and of weak shade, 0 without a `photo`.
 

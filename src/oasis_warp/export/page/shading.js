@@ -6,6 +6,7 @@ const GAMMA = 2.2; // light is sRGB to this power, nearly
 const AS_IN_PHOTO = Math.cos((5 * Math.PI) / 180), TURNED_AWAY = Math.cos((20 * Math.PI) / 180);
 const SAME_POSE = 0.9, OTHER_POSE = 0.5; // shares of the hand that face as in the photo
 const SAME_VIEW = Math.cos((10 * Math.PI) / 180), OTHER_VIEW = Math.cos((35 * Math.PI) / 180);
+const HALF_HAND = 0.08, SAME_PARALLAX = (2 * Math.PI) / 180, OTHER_PARALLAX = (7 * Math.PI) / 180; // where the photo is in doubt
 const SAME_SKY = 0.08, OTHER_SKY = 0.25; // changes of the share of the sky that skin sees, as in avatar/vertex_light.py
 const SAME_BESIDE = 0.02, OTHER_BESIDE = 0.08; // the same where the photo is in doubt
 const IN_HOLLOWS = [1, 1.2, 1.35], LEAST_LIGHT = [0.05, 0.02, 0.01]; // of light in hollows, as in avatar/sky.py
@@ -64,19 +65,22 @@ function hideLight(body, { normals, sky, change, nearby }, { harmonics, albedo, 
   largestNearby(body, sky, change, nearby);
 }
 
-// Share of the photo's shade that stays in a picture from `eye`.
-function viewShare({ data, posed, nVertices }, eye) {
-  const { photoView } = data;
-  if (!photoView) return 1;
+// Shares of the photo's shade that stay in a picture from `eye`: anywhere, and where the photo is in doubt.
+function viewShares({ data, posed, nVertices }, eye) {
+  const { photoEye } = data;
+  if (!photoEye) return [1, 1];
   const middle = [0, 0, 0];
   for (let i = 0; i < 3 * nVertices; i++) middle[i % 3] += posed[i] / nVertices;
-  const toward = eye.map((x, k) => x - middle[k]), along = toward[0] * photoView[0] + toward[1] * photoView[1] + toward[2] * photoView[2];
-  return between(along / Math.hypot(...toward), OTHER_VIEW, SAME_VIEW);
+  const toward = eye.map((x, k) => x - middle[k]), far = Math.hypot(...toward), photoFar = Math.hypot(...photoEye);
+  const along = (toward[0] * photoEye[0] + toward[1] * photoEye[1] + toward[2] * photoEye[2]) / (far * photoFar);
+  const turned = 2 - 2 * along + (HALF_HAND * (1 / far - 1 / photoFar)) ** 2;
+  return [between(along, OTHER_VIEW, SAME_VIEW), between(-turned, -(OTHER_PARALLAX ** 2), -(SAME_PARALLAX ** 2))];
 }
 
 // Factors of the colours of every vertex and the share of the photo's weak shade that is left, into shading.factors; that
 // of deep shade into shading.deep: for it, and where the photo is in doubt, the change of the sky is the largest nearby.
-// Deep shade also ends with the photo's pose, on all of the hand at once. Of both the share `viewed` is seen.
+// Deep shade also ends with the photo's pose, on all of the hand at once. Of both the first share of `viewed` is seen, and of
+// the Gaussians' own, where the photo is in doubt, the second.
 function lightVertices(body, shading, light, viewed) {
   const { shade, facing, doubt } = body.data.arrays, { normals, factors, sky, change, nearby, deep } = shading, { albedo, seen } = light;
   const bounce = albedo && albedo.map((a) => [2.0404 * a - 0.3324, -4.7951 * a + 0.6417, 2.7552 * a + 0.6903]);
@@ -92,14 +96,16 @@ function lightVertices(body, shading, light, viewed) {
     const x = normals[3 * v], y = normals[3 * v + 1], z = normals[3 * v + 2], kept = keptAt(v);
     const unsure = doubt ? doubt[v] : 0, mixed = (sure, beside) => sure + unsure * (beside - sure);
     const same = mixed(SAME_SKY, SAME_BESIDE), other = mixed(OTHER_SKY, OTHER_BESIDE);
-    const left = (moved) => viewed * (albedo && seen ? kept * (1 - between(moved, same, other)) : kept);
+    const left = (moved) => viewed[0] * (albedo && seen ? kept * (1 - between(moved, same, other)) : kept);
     deep[v] = held * left(nearby[v]);
     lightVertex(light, bounce, x, y, z, sky.exposure, body.contact.closeness[v], factors, 4 * v);
     if (shade) for (let c = 0; c < 3; c++) factors[4 * v + c] *= 1 + deep[v] * (shade[3 * v + c] - 1);
     const weak = left(mixed(change[v], nearby[v]));
     let most = 0; // of the light's own shade: where it is deep, weak shade goes with it
     if (shade) for (let c = 0; c < 3; c++) most = Math.max(most, Math.abs(shade[3 * v + c] - 1));
-    factors[4 * v + 3] = weak + between(most, WEAK, DEEP) * (Math.min(weak, deep[v]) - weak);
+    const close = 1 - unsure * (1 - viewed[1]);
+    factors[4 * v + 3] = close * (weak + between(most, WEAK, DEEP) * (Math.min(weak, deep[v]) - weak));
+    deep[v] *= close;
   }
 }
 

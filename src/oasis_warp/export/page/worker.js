@@ -9,7 +9,7 @@ async function openHand(base64) {
   for (const light of Object.values(data.lights)) light.seen = light.albedo ? data.arrays.seen : null;
   const body = makeBody(data), gaussians = makeGaussians(body);
   return {
-    body, gaussians, shading: makeShading(body, gaussians), projection: makeProjection(gaussians), angles: "", look: "", viewed: 1,
+    body, gaussians, shading: makeShading(body, gaussians), projection: makeProjection(gaussians), angles: "", look: "", viewed: [1, 1],
     partly: false, // whether a hurry left something out of the pose
     skips: false, // whether it left out the colours
   };
@@ -48,8 +48,8 @@ function drawHand(hand, wish) {
   markShown(body, gaussians, shading.normals, view.eye, partly && facing);
   if (moved || hand.partly) poseGaussians(body, gaussians);
   const same = partly && look === hand.look, skips = same && hand.partly && !hand.skips;
-  const relit = moved || hand.partly || look !== hand.look, viewed = viewShare(body, view.eye);
-  if ((relit || viewed !== hand.viewed) && !skips) paintHand(hand, look, viewed, relit, same);
+  const relit = moved || hand.partly || look !== hand.look, viewed = viewShares(body, view.eye);
+  if ((relit || viewed.join() !== hand.viewed.join()) && !skips) paintHand(hand, look, viewed, relit, same);
   Object.assign(hand, { angles: key, look, viewed: skips ? hand.viewed : viewed, partly, skips });
   if (hurry && facing && !partly) markShown(body, gaussians, shading.normals, view.eye, true);
   const count = projectGaussians(gaussians, projection, view);
