@@ -216,7 +216,8 @@ class Avatar:
             pose: One, or with an axis in front of every part many: then means, quats and scales have it too, and
                 colours where there is a `light`. Or the name of one, as in `held`.
             camera: What will see them: the photo's shade fades as it leaves the photo's side. Without one, colours do
-                not depend on the view; they are those seen from the photo's side.
+                not depend on the view; they are those seen from the photo's side, but not exactly from the photo's
+                camera: beside outlines nothing is left of other parts of the hand.
             validate: Look at the pose's values too. Waits for a CUDA device if they are there.
 
         Raises:

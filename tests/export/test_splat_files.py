@@ -118,14 +118,14 @@ def test_a_ply_shows_the_photos_shade_from_the_photos_side_alone(shaded, tmp_pat
     coefficients = read_harmonics(tmp_path / "hand.ply")
     splats, vertices = shaded.pose(pose), shaded.mesh(pose).vertices
     shown, source = {}, shaded.source_camera
-    for degrees in (0, 60, 180):
+    for degrees in (8, 60, 180):  # at 0 what is in doubt is as in the photo
         camera = orbit_camera(vertices, math.radians(degrees), size=96)
         drawn, _, _ = rasterization(
             *splats[:4], coefficients, camera.viewmat[None], camera.K[None], 96, 96, sh_degree=3
         )
         shown[degrees] = psnr(drawn[0], shaded.render(camera, pose, (0.0, 0.0, 0.0)).image)
     assert source.viewmat[:3, :3].equal(torch.eye(3)), "the file's axes are those of the world"
-    assert shown[0] > 35 and shown[60] > 25 and shown[180] > 35, shown
+    assert shown[8] > 35 and shown[60] > 25 and shown[180] > 35, shown
     plain = render(splats, orbit_camera(vertices, math.pi, size=96)).image
     assert psnr(plain, shaded.render(orbit_camera(vertices, math.pi, size=96), pose, (0.0, 0.0, 0.0)).image) < 25
 

@@ -196,9 +196,9 @@ def pose_gaussians(
     other. Values are not checked here: the caller has checked the pose. A surface that is posed many times is given as
     its `rest_mesh`. If `posed_vertices` have a leading axis of poses, so have means, quats and scales. With a `light`,
     so have the colours: they are drawn in it, without the part that the posed surface hides. With the `center` of a
-    camera, shade fades as that camera leaves the side of the photo; without, it is as the photo's camera saw it. With
-    a `bend`, folds over bent joints are open in that light, and creases in stretched skin flat. With the `closeness` of
-    the `posed_vertices` to other skin, little light comes between fingers that touch.
+    camera, shade fades as that camera leaves the side of the photo; without, it is as some degrees beside the photo.
+    With a `bend`, folds over bent joints are open in that light, and creases in stretched skin flat. With the
+    `closeness` of the `posed_vertices` to other skin, little light comes between fingers that touch.
     """
     means, quats, scales, vertex_quats = pose_mesh_gaussians(
         rest_vertices, posed_vertices, faces, canonical.face_index, canonical.barycentrics, canonical.vertex_index,
@@ -209,8 +209,11 @@ def pose_gaussians(
     if light is not None and vertex_quats is not None:
         on = lighting(posed_vertices, vertex_quats, light.normals, light.light, closeness)
         viewed = None
-        if center is not None and light.photo_eye is not None:
+        if light.photo_eye is not None and center is not None:
             viewed = view_shares(light.photo_eye, eye_from(posed_vertices, center))
+        elif light.photo_eye is not None:
+            beside = torch.eye(1, 2, dtype=means.dtype, device=means.device)[0]
+            viewed = beside.expand(*posed_vertices.shape[:-2], 2)
         of_vertices = vertex_light(light.light, on, light.seen, viewed)
         corners = light.corners or gaussian_corners(faces, canonical)
         colors = lit(canonical, of_vertices, corners, bend, posed_vertices)
