@@ -54,6 +54,26 @@ def test_what_the_skin_does_not_explain_is_in_the_photos_view_and_is_shade(hand,
     assert torch.equal(matched.colors, gaussians.colors)
 
 
+def test_no_rim_of_the_room_behind_the_hand_is_left(hand, scene):
+    """Texture learning saw pixels that are half a dark door, and hands in front of one had a black outline."""
+    crop, gaussians, light = scene
+    facing = posed_lighting(crop.rest.vertices, crop.posed.vertices, hand.faces, light).normals
+    light, seen = light._replace(facing=facing), observe(hand, crop)
+    slanted = ((seen.visibility > 0.5) & (seen.facing < 0.5)).float()[:, None]
+    room = vertex_to_gaussians(slanted, hand.faces, gaussians)
+    stained = gaussians._replace(shade=1 + room * (torch.tensor([0.2, 0.3, 1.0]) - 1))
+    mask = crop.mask[..., None]
+    taken = crop._replace(image=mask * crop.image + (1 - mask) * torch.tensor([0.1, 0.2, 0.9]))
+    border = ((crop.mask > 0.5) & (inner_mask(crop.mask, 2) < 0.5)).float()
+
+    def reddish(gaussians):
+        drawn = drawn_as_photo(hand, gaussians, taken, light)
+        return float(((drawn[..., 0] > drawn[..., 2]) * border).sum() / border.sum())
+
+    before, after = (reddish(each) for each in (stained, match_photos(hand, stained, [taken], [light], ONE)))
+    assert before < 0.6 and after > 0.8
+
+
 def test_hidden_skin_and_the_wrist_keep_their_shade(hand, scene):
     crop, gaussians, light = scene
     shade = match_photos(hand, gaussians, [crop], [light], ONE).shade

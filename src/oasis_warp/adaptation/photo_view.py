@@ -3,14 +3,16 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import cv2
+import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from oasis_warp.adaptation.sharpen import MIN_ALPHA, lit_as_photo
 from oasis_warp.avatar.anchors import rim_fade, vertex_to_gaussians
 from oasis_warp.avatar.densify import Densified
-from oasis_warp.avatar.observation import faded_in
 from oasis_warp.avatar.pose import pose_gaussians, with_shade_baked
 from oasis_warp.avatar.vertex_light import posed_lighting
 from oasis_warp.core.hand_model import HandModel
@@ -20,8 +22,9 @@ from oasis_warp.render import render, view_weights
 
 ROUNDS, OVERSHOOT = 8, 1.5
 """Steps towards the photo, and how much longer each is than the mean of what is missing."""
-BORDER = 3 / 256
-"""Share of the photo's side, at the mask's border, that may hold background, and over which pixels count more."""
+RIM, SOFT, UNSURE = 2.2 / 256, 2 / 256, 0.6
+"""Shares of the photo's side: what at the mask's border may hold background, and that much beyond it is drawn as skin;
+and the blur there. How much such a pixel counts. With the photo's pixels hands had a rim of the room behind them."""
 WRIST = 0.02
 """Distance from the wrist's end up to which nothing changes, and over which the change grows [m]."""
 FEWEST, HARDLY_SEEN = 0.05, 1.0
@@ -57,8 +60,8 @@ def match_photos(
     """Change the shade of Gaussians until their pictures are the photos.
 
     Where the photo may show something else than the fitted skin, that skin keeps its own colours; in the photo's own
-    view these were cracks and double contours beside fingers. All of the change is shade, which goes as the hand or the
-    camera moves.
+    view these were cracks and double contours beside fingers. At the mask's border the skin beside it is what Gaussians
+    are to show. All of the change is shade, which goes as the hand or the camera moves.
 
     Args:
         hand: Model of the surface.
@@ -74,8 +77,8 @@ def match_photos(
         posed = crop.posed.vertices
         lit = lit_as_photo(gaussians, faces, light, posed_lighting(rest, posed, faces, light))
         weights = view_weights(pose_gaussians(lit, faces, rest, posed), crop.camera)
-        goal, counts = crop.image * weights.alphas, faded_in(crop.mask, BORDER)[..., None]
-        views.append(_View(weights, (lit.colors * gain).clamp(0, 1), goal, counts))
+        image, counts = _skin_alone(crop)
+        views.append(_View(weights, (lit.colors * gain).clamp(0, 1), image * weights.alphas, counts))
     fade = rim_fade(rest[None], hand.rim.to(rest.device), WRIST, WRIST)[0, :, None]
     logs = _missing(views, FEWEST) * vertex_to_gaussians(fade, faces, gaussians)
     return gaussians._replace(shade=gaussians.shade * logs.exp())
@@ -111,6 +114,19 @@ def keep_pictures(
     share = vertex_to_gaussians(openly, faces, made) if made.shade is not None else 1
     changed = made._replace(colors=(made.colors * (share * logs).exp()).clamp(0, 1))
     return changed if made.shade is None else changed._replace(shade=made.shade * ((1 - share) * logs).exp())
+
+
+def _skin_alone(crop: HandCrop) -> tuple[Float[Tensor, "S S 3"], Float[Tensor, "S S 1"]]:
+    """The photo with the nearest skin at and beyond the mask's border, and how much each pixel counts."""
+    rim, mask = RIM * len(crop.mask), crop.mask.cpu().numpy() > 0.5
+    depth = distance_transform_edt(np.pad(mask, 1, mode="edge"))[1:-1, 1:-1]  # the photo's border cuts the hand
+    sure = depth > rim if (depth > rim).any() else mask
+    away, nearest = distance_transform_edt(~sure, return_indices=True)
+    image = crop.image.cpu().numpy()
+    beside = cv2.GaussianBlur(image[tuple(nearest)], (0, 0), SOFT * len(mask))
+    counts = np.where(away < 2 * rim + 1, (depth / rim).clip(UNSURE, 1), 0)
+    skin = torch.from_numpy(np.where(sure[..., None], image, beside))
+    return skin.to(crop.image), torch.from_numpy(counts).to(crop.image)[..., None]
 
 
 def _missing(views: Sequence[_View], least: float) -> Float[Tensor, "N 3"]:
