@@ -96,6 +96,7 @@ def test_where_the_photo_is_in_doubt_the_light_gets_what_continues_the_skin_arou
         for g, own in ((before, light), (after, spread))
     ]
     assert float((drawn[1] - drawn[0]).abs().quantile(0.99)) < 2 / 255
+    assert spread.shade is not None
     there = (doubted > 0) & (seen.confidence > 0.9)
     assert float(spread.shade[there].log().min()) > -0.15  # -0.7 with what the photo shows there
 

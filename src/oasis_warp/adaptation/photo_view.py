@@ -1,5 +1,8 @@
 """What the photos' cameras see: kept as Gaussians change, or changed into the photos by shade that fades elsewhere."""
 
+# SciPy's stubs do not know that `distance_transform_edt` returns distances.
+# pyright: reportOptionalSubscript=false, reportOptionalIterable=false, reportGeneralTypeIssues=false
+
 from collections.abc import Sequence
 from typing import NamedTuple
 
