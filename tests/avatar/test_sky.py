@@ -19,7 +19,7 @@ from oasis_warp.avatar.sky import (
     sky_mesh,
     studio_light,
 )
-from oasis_warp.avatar.vertex_light import Lighting, posed_lighting, remaining_shade, rotate_light
+from oasis_warp.avatar.vertex_light import Lighting, posed_lighting, remaining_shade, rotate_light, view_shares
 from oasis_warp.core import rotation
 from oasis_warp.core.camera import camera_center
 from oasis_warp.core.mirror import mirror_light, mirror_points
@@ -353,6 +353,11 @@ def test_where_the_photo_is_in_doubt_the_gaussians_shade_ends_in_next_to_any_oth
         assert ratio_of_colors(plain, as_doubted, camera) == pytest.approx(1 - 0.2 * left, abs=1e-3)
     half = ratio_of_colors(plain, as_doubted, camera_around(plain, 5))
     assert 0.85 < half < 0.95
+
+
+def test_a_camera_in_the_middle_of_the_hand_has_no_view_of_the_photo():
+    """A division by its distance made all colours NaN."""
+    assert view_shares(torch.tensor([0.0, 0.0, 0.4]), torch.zeros(3)).tolist() == [0.0, 0.0]
 
 
 def test_many_poses_have_each_their_share_of_the_shade_that_a_camera_sees(hand, scene):

@@ -30,6 +30,7 @@ NODE = shutil.which("node")
     [
         ("shading.js", "GAMMA", vertex_light.GAMMA),
         ("shading.js", "HALF_HAND", vertex_light.HALF_HAND),
+        ("shading.js", "NEAREST", vertex_light.NEAREST),
         ("shading.js", "SAME_POSE", vertex_light.SAME_POSE),
         ("shading.js", "OTHER_POSE", vertex_light.OTHER_POSE),
         ("shading.js", "SAME_SKY", vertex_light.SAME_SKY),

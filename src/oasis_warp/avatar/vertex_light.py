@@ -44,6 +44,8 @@ HALF_HAND, SAME_PARALLAX, OTHER_PARALLAX = 0.08, math.radians(2), math.radians(7
 """Half the width of a hand [m]; angles by which picture and photo see its halves from another side, up to which the
 Gaussians' shade stays and from which it is gone where the photo may show another part of the hand: beside outlines the
 fit is off by some pixels, and what lay behind a thumb had the thumb's edge. Set by eye on 4 hands of docs/looks.md."""
+NEAREST = 1e-4
+"""Least distance of a camera from the middle of the hand, of which a direction is taken [m]."""
 MIN_LIGHT = 1e-6
 """Least share of the light that shade makes up for: deep in a fist hardly any arrives."""
 _RULES = Rules(
@@ -129,7 +131,7 @@ def view_shares(photo_eye: Float[Tensor, "3"], eye: Float[Tensor, "*B 3"]) -> Fl
 
     Where it is in doubt, a camera that is nearer than the photo's is elsewhere, too.
     """
-    nearness = [1 / place.norm(dim=-1, keepdim=True) for place in (photo_eye, eye)]
+    nearness = [1 / place.norm(dim=-1, keepdim=True).clamp_min(NEAREST) for place in (photo_eye, eye)]
     before, now = (place * near for place, near in zip((photo_eye, eye), nearness, strict=True))
     turned = (before - now).square().sum(-1) + (HALF_HAND * (nearness[0] - nearness[1])).square()[..., 0]
     wide = ((before * now).sum(-1) - OTHER_VIEW) / (SAME_VIEW - OTHER_VIEW)

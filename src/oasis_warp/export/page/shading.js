@@ -6,6 +6,7 @@ const GAMMA = 2.2; // light is sRGB to this power, nearly
 const AS_IN_PHOTO = Math.cos((5 * Math.PI) / 180), TURNED_AWAY = Math.cos((20 * Math.PI) / 180);
 const SAME_POSE = 0.9, OTHER_POSE = 0.5; // shares of the hand that face as in the photo
 const SAME_VIEW = Math.cos((10 * Math.PI) / 180), OTHER_VIEW = Math.cos((35 * Math.PI) / 180);
+const NEAREST = 1e-4; // least distance of a camera, of which a direction is taken [m]
 const HALF_HAND = 0.08, SAME_PARALLAX = (2 * Math.PI) / 180, OTHER_PARALLAX = (7 * Math.PI) / 180; // where the photo is in doubt
 const SAME_SKY = 0.08, OTHER_SKY = 0.25; // changes of the share of the sky that skin sees, as in avatar/vertex_light.py
 const SAME_BESIDE = 0.02, OTHER_BESIDE = 0.08; // the same where the photo is in doubt
@@ -71,7 +72,7 @@ function viewShares({ data, posed, nVertices }, eye) {
   if (!photoEye) return [1, 1];
   const middle = [0, 0, 0];
   for (let i = 0; i < 3 * nVertices; i++) middle[i % 3] += posed[i] / nVertices;
-  const toward = eye.map((x, k) => x - middle[k]), far = Math.hypot(...toward), photoFar = Math.hypot(...photoEye);
+  const toward = eye.map((x, k) => x - middle[k]), far = Math.max(Math.hypot(...toward), NEAREST), photoFar = Math.hypot(...photoEye);
   const along = (toward[0] * photoEye[0] + toward[1] * photoEye[1] + toward[2] * photoEye[2]) / (far * photoFar);
   const turned = 2 - 2 * along + (HALF_HAND * (1 / far - 1 / photoFar)) ** 2;
   return [between(along, OTHER_VIEW, SAME_VIEW), between(-turned, -(OTHER_PARALLAX ** 2), -(SAME_PARALLAX ** 2))];
