@@ -2,7 +2,7 @@ import pytest
 import torch
 from synthetic import avatar_of, crop_of
 
-from oasis_warp.adaptation.smooth_shade import spread_shade
+from oasis_warp.adaptation.smooth_shade import IN_THE_OPEN, spread_shade
 from oasis_warp.avatar.anchors import vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.observation import observe
@@ -97,8 +97,29 @@ def test_where_the_photo_is_in_doubt_the_light_gets_what_continues_the_skin_arou
     ]
     assert float((drawn[1] - drawn[0]).abs().quantile(0.99)) < 2 / 255
     assert spread.shade is not None
-    there = (doubted > 0) & (seen.confidence > 0.9)
+    exposure = posed_lighting(crop.rest.vertices, crop.posed.vertices, hand.faces, light).exposure
+    assert exposure is not None
+    there = (doubted > 0) & (seen.confidence > 0.9) & (exposure[:, 0] > IN_THE_OPEN)
     assert float(spread.shade[there].log().min()) > -0.15  # -0.7 with what the photo shows there
+
+
+def test_a_shadow_between_parts_that_hide_the_sky_stays_where_the_photo_is_in_doubt(hand):
+    """Dark gaps between fingertips and palm were lit some degrees beside the photo, as if the fingers floated."""
+    crop, truth, _ = crop_of(hand, 0.6 * region_colors(label_regions(hand), 0.03), pose_name="fist")
+    even = torch.eye(4, 3)[:, :1].expand(4, 3)
+    light = HandLight(even, torch.tensor([[0.3], [1.3]]).expand(2, 3), even[0], albedo=torch.tensor([0.4, 0.3, 0.25]))
+    on = posed_lighting(crop.rest.vertices, crop.posed.vertices, hand.faces, light)
+    shown = shown_in(observe(hand, crop))
+    light = light._replace(shade=torch.ones_like(on.normals), facing=on.normals, doubt=torch.ones(len(shown)))
+    dark = torch.where(shown, -0.5, 0.0)[:, None].expand(-1, 3)
+    spread = spread_shade(hand, shaded(hand, truth, dark), crop, light)[1].shade
+    assert spread is not None and on.exposure is not None
+    kept, sky = spread.log(), on.exposure[:, 0]
+    in_gap, open_skin = shown & (sky < 0.5) & (hand.nail < 0.1), shown & (sky > IN_THE_OPEN)
+    # Of -0.5: the smooth field falls towards what the photo does not show. Without the shadow it is 0.
+    assert float(kept[in_gap].mean(1).median()) < -0.3 and float(kept[open_skin].min()) > -0.05
+    red, _, blue = kept[in_gap].median(0).values.tolist()
+    assert red > 0.8 * blue  # shadows of skin are warm; grey ones looked like soot
 
 
 def test_in_another_pose_no_part_of_the_hand_keeps_smooth_shade(hand, scene):

@@ -26,6 +26,14 @@ MAX_MOVED = 1.0
 """Largest logarithm that is moved: more is another part of the hand. With less, orange flecks stayed in hollows."""
 BEHIND_PASSES = 2
 """Smoothings over the mesh of the border to what the photo shows."""
+SHADOW, SHADOW_REACH = 0.003, 0.012
+"""Where the photo may show another part of the hand: the length over which shadows are smoothed, because a fit is some
+pixels off and both sides of a dark gap are dark; and how far shadows go on behind what the photo shows [m]."""
+DARKEST_SHADOW, SHADOW_HUE = -1.2, (0.75, 1.02, 1.23)
+"""Least logarithm of such a shadow, and that of red, green and blue over it, as of skin in photos (docs/looks.md)."""
+IN_SHADOW, IN_THE_OPEN = 0.65, 0.95
+"""Shares of the sky that skin sees up to which such a shadow is kept, and from which it is not. Set by eye, as the four
+above, on 6 photos of docs/looks.md: .4 and .75 lost the shadow below a thumb."""
 
 
 def spread_shade(
@@ -37,8 +45,8 @@ def spread_shade(
     the photo does, which was an edge between two tones from the side. In other poses it stayed on a palm and went from
     the fingers. The shade of the light ends on the whole hand at once (`avatar.vertex_light.remaining_shade`), and that
     of the Gaussians where skin turns. Where the photo may show another part of the hand, the light gets what continues
-    the skin around; all that the photo shows beyond that stays with the Gaussians, and ends in next to any other view.
-    The photo's view stays.
+    the skin around, or a soft shadow where the photo is darker; all that the photo shows beyond that stays with the
+    Gaussians, and ends in next to any other view. The photo's view stays.
 
     Args:
         hand: Model of the surface.
@@ -55,15 +63,22 @@ def spread_shade(
     likely = grey.clamp(DARKEST, BRIGHTEST) + (total - grey).clamp(-MAX_HUE, MAX_HUE)
     shown = seen.visibility * (seen.facing > 0)
     doubt = shown.new_zeros(1) if light.doubt is None else light.doubt
-    sure = torch.maximum(seen.confidence, RIM_WEIGHT * shown) * (1 - doubt)
-    smooth = inpaint(rest, faces, likely, sure, SMOOTH, REACH)
+    known = torch.maximum(seen.confidence, RIM_WEIGHT * shown)
+    smooth = inpaint(rest, faces, likely, known * (1 - doubt), SMOOTH, REACH)
+    on = posed_lighting(rest, crop.posed.vertices, faces, light)
+    if on.exposure is not None:
+        dark = inpaint(rest, faces, grey.clamp(DARKEST_SHADOW, 0), known, SHADOW, SHADOW_REACH)
+        shadow = torch.minimum(smooth, dark * dark.new_tensor(SHADOW_HUE))
+        covered = ((IN_THE_OPEN - on.exposure[:, 0]) / (IN_THE_OPEN - IN_SHADOW)).clamp(0, 1)
+        covered = covered * doubt * (1 - hand.nail.to(doubt))  # dark nails look bruised
+        smooth = torch.lerp(smooth, shadow, covered[:, None])
     hidden = 1 - shown[:, None]
     hidden = torch.minimum(surface.smooth_over_mesh(hidden, surface.mesh_edges(faces), BEHIND_PASSES), hidden)
     fine = MAX_FINE * torch.tanh((total - smooth) / MAX_FINE)
     to_light = torch.lerp((own - fine).clamp(-MAX_MOVED, MAX_MOVED), smooth - light.shade.log(), doubt[:, None])
     moved = light.shade * ((1 - hidden) * to_light).exp()
     # Not exp(moved) itself: light is read between vertices as a factor, and the photo's view must not change.
-    lit = shading(light, posed_lighting(rest, crop.posed.vertices, faces, light))
+    lit = shading(light, on)
     before, after = vertex_to_gaussians(torch.cat([lit * light.shade, lit * moved], 1), faces, gaussians).split(3, 1)
     behind = moved * (hidden * (smooth.clamp_max(BRIGHTEST_BEHIND) - light.shade.log())).exp()
     return gaussians._replace(shade=gaussians.shade * before / after), light._replace(shade=behind)
