@@ -5,6 +5,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
+from oasis_warp.core.sums import add_at
+
 
 def face_normals(
     vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]
@@ -21,7 +23,7 @@ def scatter_to_vertices(
     """Sum of the values of the faces around each vertex."""
     total = torch.zeros(n_vertices, values.shape[1], dtype=values.dtype, device=values.device)
     for corner in range(3):
-        total.index_add_(0, faces[:, corner], values)
+        total = add_at(total, faces[:, corner], values)
     return total
 
 
@@ -56,13 +58,10 @@ def smooth_over_mesh(
     values: Float[Tensor, "V D"], edges: Int[Tensor, "E 2"], passes: int
 ) -> Float[Tensor, "V D"]:
     """Mean of each vertex and its neighbours, `passes` times."""
-    ones = torch.ones(len(edges), 1, dtype=values.dtype, device=values.device)
-    both = torch.cat([edges, edges.flip(1)])
-    count = 1 + torch.zeros(len(values), 1, dtype=values.dtype, device=values.device).index_add_(
-        0, both[:, 0], torch.cat([ones, ones])
-    )
+    vertex, neighbour = torch.cat([edges, edges.flip(1)]).unbind(1)
+    count = add_at(values.new_ones(len(values), 1), vertex, values.new_ones(len(vertex), 1))
     for _ in range(passes):
-        values = values.index_add(0, both[:, 0], values[both[:, 1]]) / count
+        values = add_at(values, vertex, values[neighbour]) / count
     return values
 
 

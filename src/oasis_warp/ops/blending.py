@@ -13,6 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from oasis_kernels import constants
 from oasis_kernels.rasterize.tiles_cuda import INDEX_BITS
+from oasis_warp.core.sums import add_at
 from oasis_warp.ops._runtime import blend_cuda, blend_strips, blend_tiles
 from oasis_warp.ops._runtime.declaration import Array, Operator, needs_gradient
 from oasis_warp.ops._runtime.launch import contiguous, has_vectors
@@ -225,9 +226,8 @@ def absolute_gradients(
         pairs = _Pairs.front_to_back(weights.pixel_starts, weights.gaussians, weights.by_pixel, splats)
         behind_all = (g_render[c] * backgrounds[c]).sum(-1).flatten() - g_alphas[c].flatten()
         moments = pairs.moments(g_render[c].flatten(0, 1), behind_all, splats, width)
-        result[c] = torch.zeros(n, 2, dtype=torch.float64, device=result.device).index_add_(
-            0, pairs.gaussian, moments.abs()
-        )
+        zeros = torch.zeros(n, 2, dtype=torch.float64, device=result.device)
+        result[c] = add_at(zeros, pairs.gaussian, moments.abs())
     return result
 
 
