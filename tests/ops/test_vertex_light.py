@@ -65,6 +65,20 @@ def test_gradients_take_the_steps(scene):
     torch.testing.assert_close(out.detach(), vertex_light(light, on, seen, viewed), atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.parametrize("given", ["viewed", "shade", "albedo"])
+def test_a_gradient_by_the_view_or_the_light_alone_takes_the_steps_too(scene, given):
+    """A camera whose pose alone is sought got no gradient of colours, without a word."""
+    light, on, seen, viewed = scene
+    leaf = (viewed if given == "viewed" else getattr(light, given)).clone().requires_grad_()
+    if given == "viewed":
+        viewed = leaf
+    else:
+        light = light._replace(**{given: leaf})
+    out = vertex_light(light, on, seen, viewed)
+    (gradient,) = torch.autograd.grad(out.sum(), leaf)
+    assert bool(gradient.isfinite().all()) and float(gradient.abs().max()) > 0
+
+
 def test_weak_shade_goes_with_the_deep_shade_of_the_light(scene):
     """The noise of a deep shadow stayed on bright skin, as a scab, when the finger that cast it had moved."""
     light, *_ = scene

@@ -199,7 +199,7 @@ def vertex_light(
     light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | None = None, viewed: Float[Tensor, "*B 2"] | None = None
 ) -> Float[Tensor, "*B V 5"]:
     """`vertex_light_in_steps`, in one kernel where no gradient is asked."""
-    if kernels_take(on.normals, light.harmonics, light.limits):
+    if kernels_take(on.normals, viewed, *light):
         return _vertex_light_at_once(light, on, seen, viewed)
     return vertex_light_in_steps(light, on, seen, viewed)
 
