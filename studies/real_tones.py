@@ -1,8 +1,8 @@
 """How far real photos of one hand differ in the tone of one skin beside another: the floor of hidden skin's a*, b*.
 
-`oasis evaluate --dataset same-hand` asks how far the mean a* and b* of skin that a photo hides, less those of skin that it
-shows, are off in another photo of the hand. Here a third photo of the hand takes the place of the avatar. Fills
-docs/evaluation.md (real-tones).
+`oasis evaluate --dataset same-hand` takes the mean a* and b* of skin that a photo hides, less those of skin that it
+shows, and says how far an avatar's are off in another photo of the hand. Here a third photo takes the place of the
+avatar. Fills docs/evaluation.md (real-tones).
 """
 
 import itertools

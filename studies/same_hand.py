@@ -35,8 +35,9 @@ from oasis_warp.estimation.hand_crop import (
     resolutions,
 )
 from oasis_warp.evaluation.same_hand import compare_with_photo, photos_of_hands
+from oasis_warp.fitted_avatar import draw_as_photo, make_avatar
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.hand_avatar import Avatar, draw_as_photo, make_avatar
+from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import depth_map
 from oasis_warp.reconstruction import reconstruct_same_hand
 from studies.harness import AvatarOptions, Row, measured

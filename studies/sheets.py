@@ -28,9 +28,10 @@ from oasis_warp.data.square_crop import resample_square, square_around
 from oasis_warp.editing import edit
 from oasis_warp.estimation.hand_crop import CROP_MARGIN, crop_hand, detail_size, initial_offsets
 from oasis_warp.evaluation.same_hand import photos_in
+from oasis_warp.fitted_avatar import make_avatar
 from oasis_warp.hand.poses import named_pose
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.hand_avatar import Avatar, make_avatar
+from oasis_warp.hand_avatar import Avatar
 from oasis_warp.reconstruction import Reconstruction, reconstruct, reconstruct_same_hand
 from studies.harness import AvatarOptions, Row
 from studies.inputs import PHOTOS, SAME_HAND, fit_largest, photo_named, prior_named

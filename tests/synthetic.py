@@ -43,6 +43,15 @@ def avatar_of(hand, gaussians, pose, camera, light=None):
     )  # fmt: skip
 
 
+def with_invented(avatar, share):
+    """The same hand of which a `share` of each vertex is invented."""
+    return Avatar(
+        side=avatar.side, shape=avatar.shape, surface_offsets=avatar.surface_offsets, gaussians=avatar.gaussians,
+        source_pose=avatar.source_pose, source_camera=avatar.source_camera, light=avatar.light, invented=share,
+        hand=avatar.hand,
+    )  # fmt: skip
+
+
 def as_left_hand(right):
     """The left hand that is the mirror image of a right one."""
     return Avatar(

@@ -2,7 +2,7 @@ import copy
 
 import pytest
 import torch
-from synthetic import PALM_TO_CAMERA, as_left_hand, avatar_of, crop_of
+from synthetic import PALM_TO_CAMERA, as_left_hand, avatar_of, crop_of, with_invented
 
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.pose import pose_gaussians
@@ -123,12 +123,29 @@ def test_an_avatar_survives_its_file_bit_for_bit(left, tmp_path):
 
 def test_an_avatar_knows_what_of_it_is_invented_after_its_file_and_in_other_light(left, tmp_path):
     assert left.invented is None
-    left.invented = torch.linspace(0, 1, len(left.surface_offsets))
-    left.save(tmp_path / "a.safetensors")
-    share, left.invented = left.invented, None
+    share = torch.linspace(0, 1, len(left.surface_offsets))
+    with_invented(left, share).save(tmp_path / "a.safetensors")
     loaded = Avatar.load(tmp_path / "a.safetensors")
     for avatar in (loaded, loaded.in_even_light()):
         assert avatar.invented is not None and torch.equal(avatar.invented, share)
+
+
+def test_attributes_from_which_all_else_is_computed_cannot_be_set(left):
+    # Set, they changed no picture, and files held what no picture showed.
+    for name in ("light", "shape", "invented"):
+        with pytest.raises(AttributeError, match=rf"^Avatar\.{name}: attributes are fixed"):
+            setattr(left, name, None)
+
+
+def test_an_avatar_says_what_it_is(left):
+    assert repr(left) == f"Avatar(left, {len(left.gaussians.colors)} Gaussians, without light, on cpu)"
+
+
+def test_an_avatar_moves_without_gradients_and_stays_itself_where_nothing_changes(left):
+    assert left.to("cpu") is left
+    there = with_invented(left, torch.zeros(len(left.surface_offsets), requires_grad=True)).to("cpu")
+    assert there.invented is not None and not there.invented.requires_grad
+    assert torch.equal(there.pose("fist").means, left.pose("fist").means)
 
 
 def test_an_avatar_can_be_copied(left):
@@ -187,6 +204,17 @@ def test_a_camera_that_is_none_is_refused(right):
         right.render(camera, right.source_pose, (1.0, 1.0, 1.0, 1.0))
     with pytest.raises(ValueError, match=r"camera\.viewmat: expected shape \[4, 4\], got \[3, 4\]"):
         right.render(camera._replace(viewmat=camera.viewmat[:3]), right.source_pose)
+
+
+@pytest.mark.usefixtures("as_shipped")
+def test_light_and_background_of_no_number_are_refused(right):
+    # NaN was taken for the least light, and drawn as a plausible, darker picture.
+    with pytest.raises(ValueError, match="harmonics: expected finite"):
+        right.in_light(torch.full((9, 3), torch.nan))
+    with pytest.raises(ValueError, match=r"harmonics: expected shape \[9, 3\], got \[4, 3\]"):
+        right.in_light(torch.ones(4, 3))
+    with pytest.raises(ValueError, match="background: expected finite"):
+        right.render(right.source_camera, right.source_pose, (float("nan"), 0.0, 0.0))
 
 
 def test_no_side_of_any_pose_has_holes(right):

@@ -1,7 +1,7 @@
 """`Avatar`: one person's hand, ready to be posed and drawn. No image, network or estimator is needed."""
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -10,10 +10,9 @@ from torch import Tensor
 from oasis_warp.avatar.anchors import gaussian_corners
 from oasis_warp.avatar.creases import Creases, find_creases
 from oasis_warp.avatar.folds import Folds, find_folds
-from oasis_warp.avatar.pose import Bend, in_even_light, pose_gaussians
+from oasis_warp.avatar.pose import Bend, in_even_light, light_around, mean_albedo, pose_gaussians
 from oasis_warp.avatar.sky import NOTHING_HIDDEN
 from oasis_warp.avatar.vertex_light import (
-    GAMMA,
     SurfaceLight,
     eye_from,
     mirror_surface_light,
@@ -24,7 +23,7 @@ from oasis_warp.avatar.vertex_light import (
 from oasis_warp.avatar.wrist import hand_up
 from oasis_warp.core.camera import camera_center, orbit_camera
 from oasis_warp.core.color import plain_background
-from oasis_warp.core.config import BLACK, WHITE
+from oasis_warp.core.config import WHITE
 from oasis_warp.core.hand_model import MANO_SHAPES, HandModel
 from oasis_warp.core.mirror import (
     mirror_camera,
@@ -39,8 +38,6 @@ from oasis_warp.core.types import (
     CanonicalGaussians,
     Color,
     Gaussians,
-    HandCrop,
-    HandFit,
     HandLight,
     HandPose,
     PosedHand,
@@ -57,9 +54,6 @@ from oasis_warp.ops import check_finite, rest_mesh
 from oasis_warp.ops.checks import check_shape
 from oasis_warp.ops.cuda_graph import CapturedGraph, GraphCache, replayable, replayed
 from oasis_warp.render import render
-
-MIN_LIGHT, MAX_LIGHT = 0.05, 10.0
-"""Limits of a light from all around, over its mean: nine harmonics of a small lamp fall below 0 behind it."""
 
 
 class AvatarParts(NamedTuple):
@@ -82,7 +76,7 @@ class Avatar:
     the same on both sides: positive flexion closes, positive abduction goes to the thumb.
 
     `mesh` and `pose` take many poses at once: with an axis of size B before every part of the pose, their results have
-    that axis too.
+    that axis too. Attributes are fixed; `with_looks`, `in_light` and `to` give other avatars.
     """
 
     def __init__(
@@ -139,6 +133,16 @@ class Avatar:
         self._source_angles = source_pose.angles.to(self.shape)
         self._graphs = GraphCache()
         self._held: dict[str, Tensor] = {}
+        self._made = True
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if "_made" in self.__dict__:
+            raise AttributeError(f"Avatar.{name}: attributes are fixed; use `with_looks` or make another Avatar.")
+        super().__setattr__(name, value)
+
+    def __repr__(self) -> str:
+        light = "without" if self.light is None else "with"
+        return f"Avatar({self.side}, {len(self.gaussians.colors)} Gaussians, {light} light, on {self.device})"
 
     def _photo_surface(self) -> Float[Tensor, "V 3"]:
         """Vertices in the photo's pose; of a left hand in the mirror, where faces wind outwards."""
@@ -172,11 +176,16 @@ class Avatar:
             self._held[name] = named_pose(self.hand, name, self.rest)
         return self.source_pose._replace(angles=self._held[name].to(self.source_pose.angles))
 
+    def _as_pose(self, pose: HandPose | str) -> HandPose:
+        if isinstance(pose, str):
+            return self.held(pose)
+        if not isinstance(pose, HandPose):
+            raise TypeError(f"pose: expected a HandPose or a pose's name, got {type(pose).__name__}.")
+        return pose
+
     def _checked(self, pose: HandPose | str, validate: bool) -> HandPose:
         """The pose in the avatar's precision and place."""
-        if isinstance(pose, str):
-            pose = self.held(pose)
-        check_pose_type(pose)
+        pose = self._as_pose(pose)
         batch, sizes = ("B",) if pose.angles.ndim == 3 else (), {}
         hint = "One row for each joint but the wrist."
         check_shape("pose.angles", pose.angles, *batch, 15, 3, sizes=sizes, hint=hint)
@@ -216,8 +225,8 @@ class Avatar:
             pose: One, or with an axis in front of every part many: then means, quats and scales have it too, and
                 colours where there is a `light`. Or the name of one, as in `held`.
             camera: What will see them: the photo's shade fades as it leaves the photo's side. Without one, colours do
-                not depend on the view; they are those seen from the photo's side, but not exactly from the photo's
-                camera: beside outlines nothing is left of other parts of the hand.
+                not depend on the view: they are those seen from some degrees beside the photo's camera, without the
+                photo's shade near the outlines of fingers.
             validate: Look at the pose's values too. Waits for a CUDA device if they are there.
 
         Raises:
@@ -255,9 +264,10 @@ class Avatar:
 
     @torch.no_grad()
     def shade_shares(self, vertices: Float[Tensor, "V 3"], camera: Camera) -> tuple[float, float]:
-        """Shares of the photo's shade in a picture of the posed `vertices` by `camera`; all colours else are alike.
+        """How much of the photo's shade a picture of the posed `vertices` by `camera` shows: two numbers from 0 to 1.
 
-        The first is that of any shade; the second that of the Gaussians', times the first, where the photo is in doubt.
+        The first is for all shade. Where the photo may show another part of the hand (`HandLight.doubt`), the shade of
+        Gaussians is also multiplied by the second. Pictures with the same two numbers have the same colours.
         """
         if self._light is None or self._light.photo_eye is None:
             return 1.0, 1.0
@@ -282,9 +292,7 @@ class Avatar:
             TypeError: `pose` is neither a pose nor a name.
             ValueError: a part of the pose or the camera has another shape or is not finite, or no pose has that name.
         """
-        if isinstance(pose, str):
-            pose = self.held(pose)
-        check_pose_type(pose)
+        pose = self._as_pose(pose)
         check_shape("pose.angles", pose.angles, 15, 3, hint="One pose a picture.")
         check_shape("pose.orientation", pose.orientation, 3, 3)
         check_shape("pose.translation", pose.translation, 3)
@@ -292,6 +300,8 @@ class Avatar:
         check_shape("camera.K", camera.K, 3, 3)
         color = background if isinstance(background, Tensor) else torch.tensor(background)
         check_shape("background", color, 3)
+        if validate:
+            check_finite(background=color)
         if not isinstance(background, Tensor):
             color = plain_background(tuple(background), 1, like=self.shape)[0]
         named = {**pose._asdict(), "viewmat": camera.viewmat, "K": camera.K}
@@ -325,34 +335,37 @@ class Avatar:
 
         Args:
             harmonics: Result of `avatar.sky.environment_light` or `studio_light`, in the photo's camera's world.
+
+        Raises:
+            ValueError: of another shape, or not finite.
         """
-        level = self.shape.new_ones(3) if self.light is None else self.light.even
-        around = harmonics.to(level) * level.mean()
-        limits = around[0].mean() * around.new_tensor([MIN_LIGHT, MAX_LIGHT])[:, None].expand(2, 3)
-        albedo = None if self.light is None else self.light.albedo
-        if albedo is None:
-            albedo = self._mean_albedo(level)
-        light = HandLight(around, limits.contiguous(), around[0].clamp_min(MIN_LIGHT), albedo=albedo)
-        if self.side == "left":
-            light = mirror_light(light)
+        check_shape("harmonics", harmonics, 9, 3)
+        check_finite(harmonics=harmonics)
+        light = light_around(self.gaussians, self.light, harmonics)
+        light = mirror_light(light) if self.side == "left" else light
         if self.light is not None:
             light = light._replace(shade=self.light.shade, facing=self.light.facing, doubt=self.light.doubt)
         return self.with_looks(self.gaussians, light)
 
-    def _mean_albedo(self, level: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
-        return (self.gaussians.colors.mean(0) ** GAMMA * level).clamp(0, 1)
-
     def with_looks(self, gaussians: CanonicalGaussians, light: HandLight | None) -> "Avatar":
         """The same hand with other Gaussians, in `light`."""
-        return Avatar(
-            side=self.side, shape=self.shape, surface_offsets=self.surface_offsets, gaussians=gaussians,
-            source_pose=self.source_pose, source_camera=self.source_camera, light=light, invented=self.invented,
-            hand=self.hand,
-        )  # fmt: skip
+        return Avatar(**self._stored()._replace(gaussians=gaussians, light=light)._asdict(), hand=self.hand)
+
+    def to(self, device: torch.device | str) -> "Avatar":
+        """The same hand on `device`, without gradients; itself if nothing changes."""
+        stored = self._stored()
+        tensors = to_tensors(stored)
+        if not any(tensor.requires_grad or tensor.device != torch.device(device) for tensor in tensors.values()):
+            return self
+        moved = {name: tensor.detach().to(device) for name, tensor in tensors.items()}
+        return Avatar(**from_file(moved, to_header(stored, self.hand))._asdict(), hand=self.hand)
+
+    def _stored(self) -> StoredAvatar:
+        return StoredAvatar(*(getattr(self, name) for name in StoredAvatar._fields))
 
     def save(self, path: Path | str) -> None:
         """Write the avatar file (safetensors, versioned; see docs/avatar_file.md)."""
-        stored = StoredAvatar(*(getattr(self, name) for name in StoredAvatar._fields))
+        stored = self._stored()
         save_avatar(Path(path), to_tensors(stored), to_header(stored, self.hand))
 
     @classmethod
@@ -383,52 +396,7 @@ class Avatar:
         """An avatar of a file of an older version, whose light followed other rules. The photo's own view stays."""
         if self.light is None or (self.light.albedo is None and version > NOTHING_HIDDEN):
             return self
-        albedo = self._mean_albedo(self.light.even) if self.light.albedo is None else self.light.albedo
+        albedo = mean_albedo(self.gaussians, self.light)
         photo = self._photo_surface()
         light = with_todays_light(version, self.light, albedo, self.rest.vertices, photo, self.hand.faces)
         return self.with_looks(self.gaussians, light)
-
-
-def check_pose_type(pose: HandPose) -> None:
-    """Refuse arguments that are not poses.
-
-    Raises:
-        TypeError: it is none.
-    """
-    if not isinstance(pose, HandPose):
-        raise TypeError(f"pose: expected a HandPose or a pose's name, got {type(pose).__name__}.")
-
-
-def make_avatar(
-    fit: HandFit,
-    offsets: Float[Tensor, "V 3"],
-    crop: HandCrop,
-    gaussians: CanonicalGaussians,
-    light: HandLight | None = None,
-    invented: Float[Tensor, "V"] | None = None,
-    *,
-    hand: HandModel | None = None,
-) -> Avatar:
-    """The hand of `fit` with the looks of `gaussians` in `light`; `offsets` and `crop` are those of its making.
-
-    `hand` is the model of the fit, the bundled one by default.
-    """
-    return Avatar(
-        side=fit.side,
-        shape=fit.shape.to(crop.image),
-        surface_offsets=offsets.to(crop.image),
-        gaussians=gaussians,
-        source_pose=fit.pose,
-        source_camera=mirror_camera(crop.camera) if fit.side == "left" else crop.camera,
-        light=light,
-        invented=invented,
-        hand=hand,
-    )
-
-
-@torch.no_grad()
-def draw_as_photo(avatar: Avatar, crop: HandCrop, pose: HandPose) -> Render:
-    """`avatar` in the `pose` and camera of a photo, over black; a left hand is mirrored, as in its crop."""
-    left = avatar.side == "left"
-    drawn = avatar.render(mirror_camera(crop.camera) if left else crop.camera, pose, BLACK)
-    return Render(drawn.image.flip(1), drawn.alpha.flip(1)) if left else drawn

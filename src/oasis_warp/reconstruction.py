@@ -57,8 +57,9 @@ from oasis_warp.estimation.hand_crop import (
 )
 from oasis_warp.estimation.keypoints import read_keypoints
 from oasis_warp.estimation.refine import refine
+from oasis_warp.fitted_avatar import draw_as_photo, make_avatar
 from oasis_warp.hand.template import chosen_hand
-from oasis_warp.hand_avatar import Avatar, draw_as_photo, make_avatar
+from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses import Perceptual, masked_psnr
 from oasis_warp.network.heads import ColorHeads
 from oasis_warp.network.prior import choose_prior, guess_with_heads

@@ -29,7 +29,7 @@ from oasis_warp.evaluation.methods import ONE_SHOT, RAW, Method
 from oasis_warp.evaluation.metrics import HIDDEN_CONTRASTS, HIDDEN_LIKENESS
 from oasis_warp.evaluation.same_hand import compare_pairs, compare_with_photo, photos_of_hands, summarise_pairs
 from oasis_warp.evaluation.summary import read_result
-from oasis_warp.hand_avatar import draw_as_photo
+from oasis_warp.fitted_avatar import draw_as_photo
 from oasis_warp.reconstruction import Reconstruction, reconstruct
 
 SMALL = ReconstructConfig(size=96)

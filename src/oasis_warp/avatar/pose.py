@@ -35,6 +35,8 @@ shadows overshoot where a shadow ends: one spot of skin was black. The rest is s
 IN_SHADOW = 0.5, 0.8
 """How dark shade is, as the mean of logarithms, from which less detail in it is skin, and from which none is. It was
 orange flecks on one back, in a shadow in which the camera had lost the blue."""
+AROUND_LIMITS = 0.05, 10.0
+"""Least and most of a light from all around, over its mean: nine harmonics of a small lamp fall below 0 behind it."""
 MIN_COLOR = 1e-3
 """Least colour that has shade: it is a factor."""
 
@@ -131,6 +133,25 @@ def lit(
 def in_even_light(canonical: CanonicalGaussians, light: HandLight) -> CanonicalGaussians:
     """The same without light that depends on the direction."""
     return canonical._replace(colors=(canonical.colors * light.even.pow(1 / GAMMA)).clamp(0, 1), shade=None)
+
+
+def mean_albedo(canonical: CanonicalGaussians, light: HandLight | None) -> Float[Tensor, "3"]:
+    """Reflectance from which light bounces: that of `light` if known, else the mean of the skin in its even light."""
+    if light is not None and light.albedo is not None:
+        return light.albedo
+    level = canonical.colors.new_ones(3) if light is None else light.even
+    return (canonical.colors.mean(0) ** GAMMA * level).clamp(0, 1)
+
+
+def light_around(
+    canonical: CanonicalGaussians, light: HandLight | None, harmonics: Float[Tensor, "9 3"]
+) -> HandLight:
+    """Another light for the same Gaussians, as bright on average as `light`, without any shade."""
+    level = canonical.colors.new_ones(3) if light is None else light.even
+    around = harmonics.to(level) * level.mean()
+    limits = around[0].mean() * around.new_tensor(AROUND_LIMITS)[:, None].expand(2, 3)
+    even = around[0].clamp_min(AROUND_LIMITS[0])
+    return HandLight(around, limits.contiguous(), even, albedo=mean_albedo(canonical, light))
 
 
 def with_shade_baked(canonical: CanonicalGaussians) -> CanonicalGaussians:

@@ -36,9 +36,10 @@ from oasis_warp.evaluation.methods import Method, prior_digest, reconstructions
 from oasis_warp.evaluation.metrics import TargetTruth, score
 from oasis_warp.evaluation.pictures import ATTENTION_COLUMNS, tile, write_attention, write_sheet, write_strip
 from oasis_warp.evaluation.summary import Record, mean
+from oasis_warp.fitted_avatar import make_avatar
 from oasis_warp.hand.mano import read_mano
 from oasis_warp.hand.template import MANO_DIR, chosen_hand
-from oasis_warp.hand_avatar import Avatar, make_avatar
+from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses import Perceptual
 
 SETTINGS, METRICS, SHEET, AVATARS = "evaluation.json", "metrics.json", "sheet.png", "avatars"

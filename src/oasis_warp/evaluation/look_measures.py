@@ -44,8 +44,9 @@ from oasis_warp.evaluation.views import (
     without_arm,
     wrist_end,
 )
+from oasis_warp.fitted_avatar import make_avatar
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.hand_avatar import Avatar, make_avatar
+from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses import Perceptual
 from oasis_warp.reconstruction import Reconstruction
 

@@ -33,8 +33,9 @@ from oasis_warp.evaluation.metrics import COVERED, color_gain
 from oasis_warp.evaluation.pictures import tile, write_sheet, write_strip
 from oasis_warp.evaluation.summary import Record, read_result, select
 from oasis_warp.evaluation.views import read_crop, read_surface
+from oasis_warp.fitted_avatar import draw_as_photo, make_avatar
 from oasis_warp.hand.template import bundled_hand
-from oasis_warp.hand_avatar import Avatar, draw_as_photo, make_avatar
+from oasis_warp.hand_avatar import Avatar
 from oasis_warp.losses import masked_psnr, ssim_map
 from oasis_warp.reconstruction import Reconstruction, reconstruct
 

@@ -2,13 +2,11 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import torch
-from torch import Tensor
 
 from oasis_warp.core.errors import InputError
-from oasis_warp.core.types import Camera, CanonicalGaussians, HandLight, HandPose, Photo
+from oasis_warp.core.types import HandPose, Photo
 from oasis_warp.export import usd
 from oasis_warp.export.hand_parameters import write_parameters
 from oasis_warp.export.page_file import write_page
@@ -97,22 +95,4 @@ def export_avatar(
         check_shape("pose.translation", pose.translation, 3)
         check_finite(**pose._asdict())
         pose = HandPose(*(part.detach().to(avatar.shape).cpu() for part in pose))
-    writer(ExportRequest(on_cpu(avatar), pose, light, photo), Path(path))
-
-
-def on_cpu(avatar: Avatar) -> Avatar:
-    """The same avatar on the CPU, where files are made, and without gradients."""
-    light, parts = avatar.light, (*avatar.gaussians, avatar.shape, avatar.surface_offsets)
-    if avatar.device.type == "cpu" and not any(part is not None and part.requires_grad for part in parts):
-        return avatar
-
-    def moved(part: Any) -> Any:
-        return part.detach().cpu() if isinstance(part, Tensor) else part
-
-    return Avatar(
-        side=avatar.side, shape=moved(avatar.shape), surface_offsets=moved(avatar.surface_offsets),
-        gaussians=CanonicalGaussians(*map(moved, avatar.gaussians)),
-        source_pose=HandPose(*map(moved, avatar.source_pose)), source_camera=Camera(*map(moved, avatar.source_camera)),
-        light=None if light is None else HandLight(*map(moved, light)), invented=moved(avatar.invented),
-        hand=avatar.hand.to("cpu"),
-    )  # fmt: skip
+    writer(ExportRequest(avatar.to("cpu"), pose, light, photo), Path(path))
