@@ -26,7 +26,7 @@ PAINTED = "painted"
 STAGES = (RAW, CALIBRATED, EVEN, KEEP, ONE_SHOT, PAINTED)
 """The prior's guess; its colours matched to the photo's as a whole; adapted to what is likelier albedo than shading;
 adapted to all that the photo shows, with its light baked in; the same with the light apart; and with painted unseen
-skin, as avatars ship."""
+skin. `reconstruct` goes on from there: see `reconstruction._finish`."""
 
 
 class Method(NamedTuple):
