@@ -42,7 +42,7 @@ _FIST: dict[str, Finger] = {
 # positive towards the thumb. Where the thumb touches a finger, the angles give the smallest gap without
 # self-intersection. With the index bent as far as the others, light came through a fist along all fingers.
 _THUMBS: dict[str, Thumb] = {
-    "open": (-10, 14, 0, 0, 0),
+    "open": (-25, -5, 18, 0, 6),
     "relaxed": (8, -4, 0, 14, 16),
     "fist": (28, 15, -14, 45, 68),
     "pinch": (35, 10, -10, 2, 5),
