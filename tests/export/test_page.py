@@ -22,6 +22,7 @@ from tests.export.page_parts import LARGEST, section
 
 from oasis_warp.avatar.sky import studio_light
 from oasis_warp.core.camera import orbit_camera
+from oasis_warp.core.errors import InputError
 from oasis_warp.data.splat_files import read_splats
 from oasis_warp.export import export_avatar
 from oasis_warp.export.page_data import joint_sliders, unpack_data
@@ -105,6 +106,29 @@ def test_what_the_page_reads_are_the_gaussians(avatar, pages):
         assert np.abs(arrays[name] - getattr(stored, name).flatten().numpy()).max() <= step, name
     assert facts["side"] == avatar.side
     assert facts["lights"].keys() == {"photo", "studio"}
+
+
+def test_the_page_keeps_how_black_specks_fade(right_hand):
+    """A byte that ended at a logarithm of 1 made a mole on a palm darker instead of paler as the skin is stretched."""
+    gaussians = right_hand.gaussians
+    creases = right_hand.in_light(studio_light()).parts.creases
+    colors = gaussians.colors.index_fill(0, creases.index[::500], 0.01)
+    specked = right_hand.with_looks(gaussians._replace(colors=colors), right_hand.light)
+    parts = specked.in_light(studio_light()).parts
+    expected = torch.zeros_like(colors).index_copy(0, parts.folds.index, parts.folds.change)
+    expected = expected.index_copy(0, parts.creases.index, parts.creases.change)
+    most = float(expected.abs().max())
+    assert most > 2
+    _, arrays = unpack_data(section(page_html(specked, "x"), "data"))
+    assert np.abs(arrays["folds"] - expected.flatten().numpy()).max() < 0.51 * most / 127  # half a step
+
+
+def test_values_that_their_bytes_cannot_hold_are_refused(right_hand):
+    gaussians = right_hand.gaussians
+    for opacity in (1.2, -0.1, float("nan")):
+        wrong = gaussians._replace(opacities=gaussians.opacities.index_fill(0, torch.tensor([3]), opacity))
+        with pytest.raises(InputError, match=rf"expected values from 0 to 1, got .*{opacity}.*; reconstruct"):
+            page_html(right_hand.with_looks(wrong, right_hand.light), "x")
 
 
 def test_sliders_move_what_they_say_within_the_limits(hand):
