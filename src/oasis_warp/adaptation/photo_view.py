@@ -13,7 +13,8 @@ from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from oasis_warp.adaptation.sharpen import MIN_ALPHA, lit_as_photo
+from oasis_warp.adaptation.sharpen import lit_as_photo
+from oasis_warp.adaptation.unlit import MIN_ALPHA
 from oasis_warp.avatar.anchors import rim_fade, vertex_to_gaussians
 from oasis_warp.avatar.densify import Densified
 from oasis_warp.avatar.pose import pose_gaussians, with_shade_baked
