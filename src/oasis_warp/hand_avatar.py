@@ -14,8 +14,8 @@ from oasis_warp.avatar.pose import Bend, in_even_light, light_around, mean_albed
 from oasis_warp.avatar.sky import NOTHING_HIDDEN
 from oasis_warp.avatar.vertex_light import (
     SurfaceLight,
-    eye_from,
     mirror_surface_light,
+    offset_to_camera,
     view_shares,
     with_photo,
     with_todays_light,
@@ -271,7 +271,7 @@ class Avatar:
         """
         if self._light is None or self._light.photo_eye is None:
             return 1.0, 1.0
-        eye = eye_from(vertices, camera_center(camera.viewmat.to(vertices)))
+        eye = offset_to_camera(vertices, camera_center(camera.viewmat.to(vertices)))
         anywhere, in_doubt = view_shares(self._light.photo_eye, eye).tolist()
         return anywhere, in_doubt
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from synthetic import crop_of
 
-from oasis_warp.adaptation.photo_view import match_photos
+from oasis_warp.adaptation.photo_view import _skin_alone, match_photos
 from oasis_warp.avatar.anchors import vertex_to_gaussians
 from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.observation import inner_mask, observe
@@ -90,6 +90,14 @@ def distance_to_seen(hand, crop, gaussians):
     seen = observe(hand, crop).confidence > 0
     distance = torch.cdist(crop.posed.vertices, crop.posed.vertices[seen]).amin(1)[:, None]
     return vertex_to_gaussians(distance, hand.faces, gaussians)[:, 0]
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_a_mask_without_a_border_counts_everywhere_or_nowhere(scene, share):
+    """SciPy's distances to a border that is not there replaced and doubted pixels of the upper left corner."""
+    image = torch.rand(512, 512, 3, generator=torch.Generator().manual_seed(0))
+    skin, counts = _skin_alone(scene[0]._replace(image=image, mask=torch.full((512, 512), share)))
+    assert torch.equal(skin, image) and (counts == share).all()
 
 
 def test_without_shade_nothing_changes(hand, scene):

@@ -22,9 +22,10 @@ from tests.export.page_parts import LARGEST, section
 
 from oasis_warp.avatar.sky import studio_light
 from oasis_warp.core.camera import orbit_camera
+from oasis_warp.core.errors import InputError
 from oasis_warp.data.splat_files import read_splats
 from oasis_warp.export import export_avatar
-from oasis_warp.export.page_data import joint_sliders, unpack_data
+from oasis_warp.export.page_data import joint_sliders, pack_data, page_facts, unpack_data
 from oasis_warp.export.page_file import page_html, splats_html
 from oasis_warp.hand import skinning as hand_skinning
 from oasis_warp.hand.poses import POSE_NAMES, named_pose
@@ -105,6 +106,29 @@ def test_what_the_page_reads_are_the_gaussians(avatar, pages):
         assert np.abs(arrays[name] - getattr(stored, name).flatten().numpy()).max() <= step, name
     assert facts["side"] == avatar.side
     assert facts["lights"].keys() == {"photo", "studio"}
+
+
+def test_the_page_keeps_how_black_specks_fade(right_hand):
+    """A byte that ended at a logarithm of 1 made a mole on a palm darker instead of paler as the skin is stretched."""
+    gaussians = right_hand.gaussians
+    creases = right_hand.in_light(studio_light()).parts.creases
+    colors = gaussians.colors.index_fill(0, creases.index[::500], 0.01)
+    specked = right_hand.with_looks(gaussians._replace(colors=colors), right_hand.light)
+    parts = specked.in_light(studio_light()).parts
+    expected = torch.zeros_like(colors).index_copy(0, parts.folds.index, parts.folds.change)
+    expected = expected.index_copy(0, parts.creases.index, parts.creases.change)
+    most = float(expected.abs().max())
+    assert most > 2
+    _, arrays = unpack_data(section(page_html(specked, "x"), "data"))
+    assert np.abs(arrays["folds"] - expected.flatten().numpy()).max() < 0.51 * most / 127  # half a step
+
+
+def test_values_that_their_bytes_cannot_hold_are_refused(right_hand):
+    gaussians = right_hand.gaussians
+    for opacity in (1.2, -0.1, float("nan")):
+        wrong = gaussians._replace(opacities=gaussians.opacities.index_fill(0, torch.tensor([3]), opacity))
+        with pytest.raises(InputError, match=rf"expected values from 0 to 1, got .*{opacity}.*; reconstruct"):
+            page_html(right_hand.with_looks(wrong, right_hand.light), "x")
 
 
 def test_sliders_move_what_they_say_within_the_limits(hand):
@@ -293,6 +317,62 @@ def test_a_moving_hand_is_fluent_without_a_graphics_card(pages, tmp_path):
     assert min(width, height) >= 500
     print(f"{rate:.1f} pictures a second of {width:.0f} x {height:.0f}, {speed:.0f} rounds a second")
     assert rate / speed > QUIET_SHARE / 2, (rate, speed)
+
+
+FAILING = """
+<script>oasis.ready.then(async (viewer) => {
+  const said = [], wrong = [{ look: "map" }, { look: "map" }, { width: 1e6, height: 1e6 }]; // no map, and no memory
+  for (const job of wrong) await oasis.picture(job).catch((error) => said.push(error.message));
+  for (viewer.look = "map"; said.length < 6; said.push(byId("status").textContent)) {
+    show(viewer);
+    await new Promise((resolve) => setTimeout(resolve, 500));
+  }
+  viewer.look = "even";
+  const draw = viewer.draw, drawn = new Promise((resolve) => viewer.draw = (...given) => draw(...given).then(resolve));
+  show(viewer);
+  await drawn;
+  said.push((await oasis.picture({ width: 64, height: 64 })).type);
+  fetch("/drawn", { method: "POST", body: JSON.stringify(said) });
+}, (error) => {
+  fetch("/failed", { method: "POST", body: JSON.stringify([error.message, byId("status").textContent]) });
+})</script>
+"""
+NOT_DRAWN = r"A picture could not be drawn \([^\n]+\); choose another, or load the page again\."
+
+
+def said_by(page, profile):
+    """What a page sends whose pictures fail."""
+    page = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page).replace("</body>", FAILING + "</body>")
+    with browser_with(page, "processor", profile) as received:
+        path, body = received.get(timeout=100)
+    return path, json.loads(body)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
+def test_a_page_whose_picture_failed_says_why_and_draws_the_next(pages, tmp_path):
+    """After two failures it drew nothing more, and scripts waited for their pictures for ever."""
+    path, (*said, kind) = said_by(pages["right"], tmp_path / "profile")
+    assert (path, len(said), kind) == ("/drawn", 6, "image/png")
+    for sentence in said:
+        assert re.fullmatch(NOT_DRAWN, sentence)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
+@pytest.mark.parametrize("fault", ["data", "picture"])
+def test_a_page_that_cannot_begin_says_why(right_hand, pages, tmp_path, fault):
+    facts, arrays = page_facts(right_hand, None, "photo")
+    facts["start"]["look"] = "map"
+    data, message = {
+        "data": ("no data", r"The hand could not be opened \([^\n]+\); export it again\."),
+        "picture": (pack_data(facts, arrays), NOT_DRAWN),
+    }[fault]
+    page = pages["right"].replace(section(pages["right"], "data"), data)
+    path, said = said_by(page, tmp_path / "profile")
+    assert path == "/failed"
+    for sentence in said:
+        assert re.fullmatch(message, sentence)
 
 
 def test_all_named_poses_are_on_the_page(pages):

@@ -1,10 +1,13 @@
 """The page's own script, run without a browser, computes what Python does."""
 
 import dataclasses
+import inspect
 import json
+import math
 import re
 import shutil
 import subprocess
+import types
 
 import numpy as np
 import pytest
@@ -14,55 +17,71 @@ from tests.export.page_parts import LARGEST, section
 
 from oasis_kernels import constants
 from oasis_kernels.scene import sky_exposure as kernels
-from oasis_warp.avatar import vertex_light
+from oasis_warp.avatar import creases, folds, sky, vertex_light
 from oasis_warp.avatar.sky import studio_light
 from oasis_warp.core.camera import ORBIT_FIELD_OF_VIEW, orbit_camera
-from oasis_warp.export.page_data import NO_JOINT, unpack_data
+from oasis_warp.export import page_data
+from oasis_warp.export.page_data import unpack_data
 from oasis_warp.export.page_file import page_html, page_text
-from oasis_warp.ops import contact
+from oasis_warp.hand import contact as hand_contact
+from oasis_warp.ops import contact, rasterization
 from oasis_warp.reference import posing
 
 NODE = shutil.which("node")
+JS_MATH = types.SimpleNamespace(PI=math.pi, cos=math.cos)
+"""What the script's constants, whose formulas are Python as well, use of its `Math`."""
 
 
-@pytest.mark.parametrize(
-    ("file", "name", "value"),
-    [
-        ("shading.js", "GAMMA", vertex_light.GAMMA),
-        ("shading.js", "HALF_HAND", vertex_light.HALF_HAND),
-        ("shading.js", "NEAREST", vertex_light.NEAREST),
-        ("shading.js", "SAME_POSE", vertex_light.SAME_POSE),
-        ("shading.js", "OTHER_POSE", vertex_light.OTHER_POSE),
-        ("shading.js", "SAME_SKY", vertex_light.SAME_SKY),
-        ("shading.js", "OTHER_SKY", vertex_light.OTHER_SKY),
-        ("shading.js", "SAME_BESIDE", vertex_light.SAME_BESIDE),
-        ("shading.js", "OTHER_BESIDE", vertex_light.OTHER_BESIDE),
-        ("shading.js", "NO_JOINT", NO_JOINT),
-        ("shading.js", "WEAK", vertex_light.WEAK),
-        ("shading.js", "DEEP", vertex_light.DEEP),
-        ("sky.js", "BUFFER", kernels.SIZE),
-        ("sky.js", "MARGIN", kernels.MARGIN),
-        ("sky.js", "LIFT", kernels.LIFT),
-        ("contact.js", "DEEPEST", contact.DEEPEST),
-        ("contact.js", "ASIDE", contact.ASIDE),
-        ("contact.js", "PUSH", contact.MARGIN),
-        ("contact.js", "PAD", contact.PAD),
-        ("contact.js", "OPPOSED", contact.OPPOSED),
-        ("contact.js", "PARTS_OPPOSED", contact.PARTS_OPPOSED),
-        ("contact.js", "FADES", contact.FADES),
-        ("contact.js", "ROUNDS", contact.kernels.ROUNDS),
-        ("posing.js", "FLAT", posing.FLAT),
-        ("posing.js", "DAMPING", posing.DAMPING),
-        ("posing.js", "MAX_GROWTH", posing.LIMIT),
-        ("projection.js", "EPS2D", constants.EPS2D),
-        ("projection.js", "JACOBIAN_LIMIT", constants.JACOBIAN_LIMIT),
-        ("raster.js", "EXACT = { opaque: 1 / 100, reach:", constants.EXTENT_SIGMAS),
-    ],
-)
-def test_the_script_has_the_constants_of_the_operators(file, name, value):
-    sign = "" if name.endswith(":") else " ="
-    (found,) = re.findall(rf"\b{re.escape(name)}{sign} ([\d.e-]+)", page_text(file))
-    assert float(found) == pytest.approx(value, rel=1e-12)
+def vars_of(module, names):
+    """Constants of a module by name."""
+    return {name: getattr(module, name) for name in names.split()}
+
+
+RULES = {
+    "shading.js": {
+        **vars_of(vertex_light, "GAMMA AS_IN_PHOTO TURNED_AWAY SAME_POSE OTHER_POSE SAME_VIEW OTHER_VIEW NEAREST"),
+        **vars_of(vertex_light, "HALF_HAND SAME_PARALLAX OTHER_PARALLAX SAME_SKY OTHER_SKY SAME_BESIDE OTHER_BESIDE"),
+        **vars_of(vertex_light, "WEAK DEEP"),
+        **vars_of(sky, "IN_HOLLOWS LEAST_LIGHT IN_CREVICES DEEP_INSIDE OUTSIDE"),
+        **vars_of(folds, "CLOSED OPENED"),
+        **vars_of(creases, "STRETCHED LEAST_AREA"), "UNSTRETCHED": creases.AS_IN_PHOTO,
+        **vars_of(page_data, "NO_JOINT STRETCH"),
+    },
+    "sky.js": {
+        **vars_of(kernels, "MARGIN LIFT STEEPEST"), "BUFFER": kernels.SIZE, "MIN_LIGHT": kernels.LEAST,
+        "NEARBY": sky.NEARBY, "LOBE": [sky.LOBE[degree] for degree in sky.DEGREES],
+    },
+    "contact.js": {
+        **vars_of(contact, "DEEPEST ASIDE PAD OPPOSED PARTS_OPPOSED FADES BETWEEN"), "PUSH": contact.MARGIN,
+        "ROUNDS": contact.kernels.ROUNDS, **vars_of(hand_contact, "CREVICE FREE"),
+    },
+    "posing.js": {**vars_of(posing, "FLAT DAMPING"), "MAX_GROWTH": posing.LIMIT},
+    "projection.js": {
+        **vars_of(constants, "EPS2D JACOBIAN_LIMIT"),
+        "NEAR": inspect.signature(rasterization).parameters["near_plane"].default,
+    },
+}  # fmt: skip
+"""Values in Python of the constants of the script's files."""
+OWN = {
+    "shading.js": {"MAP_SEEN", "MAP_INVENTED", "MAP_SKIN"}, "sky.js": {"HURRY"}, "contact.js": {"BOX"},
+    "posing.js": set(), "projection.js": {"FACES_AWAY", "STRIDE", "DEPTHS"},
+}  # fmt: skip
+"""Constants that only the script has."""
+
+
+@pytest.mark.parametrize("file", RULES)
+def test_the_script_has_the_constants_of_python(file):
+    found = {}
+    for line in re.findall(r"^const ([A-Z].*?);", page_text(file), re.MULTILINE):
+        found |= dict(each.split(" = ") for each in re.split(r", (?=[A-Z_\d]+ = )", line))
+    assert found.keys() - OWN[file] == RULES[file].keys()
+    for name, value in RULES[file].items():
+        assert eval(found[name], {"Math": JS_MATH}) == pytest.approx(value, rel=1e-12), name
+
+
+def test_the_script_draws_gaussians_as_far_out_as_the_operator():
+    (found,) = re.findall(r"EXACT = {.* reach: ([\d.]+)", page_text("raster.js"))
+    assert float(found) == constants.EXTENT_SIGMAS
 
 
 NODE_CHECK = """

@@ -13,7 +13,8 @@ from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from oasis_warp.adaptation.sharpen import MIN_ALPHA, lit_as_photo
+from oasis_warp.adaptation.sharpen import lit_as_photo
+from oasis_warp.adaptation.unlit import MIN_ALPHA
 from oasis_warp.avatar.anchors import rim_fade, vertex_to_gaussians
 from oasis_warp.avatar.densify import Densified
 from oasis_warp.avatar.pose import pose_gaussians, with_shade_baked
@@ -25,9 +26,13 @@ from oasis_warp.render import render, view_weights
 
 ROUNDS, OVERSHOOT = 8, 1.5
 """Steps towards the photo, and how much longer each is than the mean of what is missing."""
-RIM, SOFT, UNSURE = 2.2 / 256, 2 / 256, 0.6
-"""Shares of the photo's side: what at the mask's border may hold background, and that much beyond it is drawn as skin;
-and the blur there. How much such a pixel counts. With the photo's pixels hands had a rim of the room behind them."""
+RIM = 2.2 / 256
+"""Distance from the mask's border up to which a pixel may hold background, as a share of the crop's side. Such pixels,
+and as far outside, take the nearest sure skin: with the photo's pixels hands had a rim of the room behind them."""
+SOFT = 2 / 256
+"""Standard deviation of the blur of the skin that they take, as a share of the crop's side."""
+UNSURE = 0.6
+"""Weight of these pixels at the border and outside; inside it grows to 1, that of sure ones."""
 WRIST = 0.02
 """Distance from the wrist's end up to which nothing changes, and over which the change grows [m]."""
 FEWEST, HARDLY_SEEN = 0.05, 1.0
@@ -62,9 +67,9 @@ def match_photos(
 ) -> CanonicalGaussians:
     """Change the shade of Gaussians until their pictures are the photos.
 
-    Where the photo may show something else than the fitted skin, that skin keeps its own colours; in the photo's own
-    view these were cracks and double contours beside fingers. At the mask's border the skin beside it is what Gaussians
-    are to show. All of the change is shade, which goes as the hand or the camera moves.
+    Without this step, skin that was fitted beside its place is a crack or a double contour in the photo's view. Beside
+    the mask's border, where pixels may hold background, Gaussians are to show the nearest sure skin. Only the shade
+    changes, which fades as the hand or the camera moves.
 
     Args:
         hand: Model of the surface.
@@ -120,8 +125,13 @@ def keep_pictures(
 
 
 def _skin_alone(crop: HandCrop) -> tuple[Float[Tensor, "S S 3"], Float[Tensor, "S S 1"]]:
-    """The photo with the nearest skin at and beyond the mask's border, and how much each pixel counts."""
+    """The photo with the nearest skin at and beyond the mask's border, and how much each pixel counts.
+
+    A mask of the whole crop has no border: all of it counts. Of an empty one nothing does.
+    """
     rim, mask = RIM * len(crop.mask), crop.mask.cpu().numpy() > 0.5
+    if mask.all() or not mask.any():  # distances to a border are undefined
+        return crop.image, torch.full_like(crop.image[..., :1], float(mask.all()))
     depth = distance_transform_edt(np.pad(mask, 1, mode="edge"))[1:-1, 1:-1]  # the photo's border cuts the hand
     sure = depth > rim if (depth > rim).any() else mask
     away, nearest = distance_transform_edt(~sure, return_indices=True)

@@ -21,6 +21,7 @@ from oasis_warp.adaptation.reprojection import (
     reproject,
     with_neighbours,
 )
+from oasis_warp.adaptation.unlit import MIN_ALPHA
 from oasis_warp.avatar.anchors import RIM_FADE, vertex_to_gaussians
 from oasis_warp.avatar.densify import FITTED, densify, parts_for_spacing
 from oasis_warp.avatar.observation import faded_in
@@ -49,8 +50,6 @@ THICKNESS = 0.45e-3
 """Standard deviation of finer Gaussians across the surface [m]. The surface that carries Gaussians lies below the skin,
 which coarse ones reach because they are thick: with thin ones fingers lose half a millimetre. With .6 mm none is lost,
 but outlines get rough."""
-MIN_ALPHA = 0.05
-"""Below it a pixel says nothing about the colour of the hand."""
 MIN_FACTOR = 0.02
 """Least factor of the light by which colours are divided."""
 STEPS = 10

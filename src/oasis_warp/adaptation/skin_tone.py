@@ -9,18 +9,16 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from oasis_warp.avatar.appearance import Regions, skin_color, skin_regions
+from oasis_warp.avatar.appearance import BLOOD_MEAN, Regions, nail_color, skin_color, skin_melanin, skin_regions
 from oasis_warp.avatar.prior import DARKEST, LIGHTEST, SIGMA_CAST, SIGMA_EXPOSURE, TONES
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.hand.template import bundled_hand
 
 SIGMA_COLOR = 0.05
 """Expected difference of a person's skin from the mean of that region and tone, as a logarithm."""
-BLOOD = 0.0125
-"""Share of blood in the skin of a back."""
 PALM_BLOOD, TIP_BLOOD, KNUCKLE_BLOOD = 1.1, 0.7, 1.1
-"""How much more of it palms, finger tips and knuckles have. With it palm minus back in CIELAB's a* is +2 to +6, as on
-real hands."""
+"""How much more blood palms, finger tips and knuckles have than backs. With it palm minus back in CIELAB's a* is +2 to
++6, as on real hands."""
 KNUCKLE_MELANIN = 0.15
 """How much more melanin knuckles have."""
 SURE_PLACE, FEWEST = 0.006, 200
@@ -127,14 +125,8 @@ def _tone_table() -> tuple[Float[Tensor, "T V 3"], Float[Tensor, "T 3"]]:
 
 
 def tone_colors(regions: Regions, melanin: float) -> tuple[Float[Tensor, "V 3"], Float[Tensor, "3"]]:
-    """Evenly lit sRGB colours of smooth skin and of nails of a hand whose back has this `melanin` share.
-
-    A palm holds about a third of the melanin of the back, but a light palm holds no less than the back.
-    """
+    """Evenly lit sRGB colours of smooth skin and of nails of a hand whose back has this `melanin` share."""
     palm, tip, knuckle = regions.palm, regions.finger_tip, regions.knuckle
-    palm_melanin = min(0.6 * melanin, 0.006 + 0.33 * melanin)
-    amount = ((1 - palm) * math.log(1.15 * melanin) + palm * math.log(palm_melanin)).exp()
-    amount = amount * (1 + KNUCKLE_MELANIN * knuckle)
-    blood = BLOOD * (1 + PALM_BLOOD * palm + TIP_BLOOD * tip * (0.4 + 0.6 * palm) + KNUCKLE_BLOOD * knuckle)
-    bed = skin_color(amount.new_tensor([0.5 * melanin]), amount.new_tensor([1.9 * BLOOD]))[0]
-    return skin_color(amount, blood), 0.86 * bed + 0.14
+    amount = skin_melanin(palm, melanin) * (1 + KNUCKLE_MELANIN * knuckle)
+    blood = BLOOD_MEAN * (1 + PALM_BLOOD * palm + TIP_BLOOD * tip * (0.4 + 0.6 * palm) + KNUCKLE_BLOOD * knuckle)
+    return skin_color(amount, blood), nail_color(amount.new_tensor([melanin]))[0]

@@ -147,22 +147,31 @@ def skin_regions(hand: HandModel) -> Regions:
     return label_regions(hand)._replace(palm=palm)
 
 
-def region_colors(regions: Regions, melanin: float) -> Float[Tensor, "V 3"]:
-    """Evenly lit sRGB colours of a hand whose back has the given `melanin` share.
+def skin_melanin(palm: Float[Tensor, "V"], melanin: float) -> Float[Tensor, "V"]:
+    """Share of melanin in smooth skin of a hand whose back has the share `melanin`, given what is `palm`.
 
     Palms hold about a third of the melanin of backs, and light ones no less: the difference grows with the tone.
     """
-    palm, tip, knuckle, crease, nail, mottle = regions
     palm_melanin = min(0.6 * melanin, 0.006 + 0.33 * melanin)
-    log_melanin = (1 - palm) * math.log(melanin * 1.15) + palm * math.log(palm_melanin)
-    amount = log_melanin.exp() * (1 + 0.3 * knuckle + 0.25 * crease) * (1 + MOTTLE_MELANIN * mottle)
+    return ((1 - palm) * math.log(melanin * 1.15) + palm * math.log(palm_melanin)).exp()
+
+
+def nail_color(melanin: Float[Tensor, "N"]) -> Float[Tensor, "N 3"]:
+    """Evenly lit sRGB colours of nails among skin of such shares of melanin: their beds, seen through the plates."""
+    bed = skin_color(0.5 * melanin, torch.full_like(melanin, 1.9 * BLOOD_MEAN))
+    return (1 - NAIL_WHITE) * bed + NAIL_WHITE
+
+
+def region_colors(regions: Regions, melanin: float) -> Float[Tensor, "V 3"]:
+    """Evenly lit sRGB colours of a hand whose back has the given `melanin` share."""
+    palm, tip, knuckle, crease, nail, mottle = regions
+    smooth = skin_melanin(palm, melanin)
+    amount = smooth * (1 + 0.3 * knuckle + 0.25 * crease) * (1 + MOTTLE_MELANIN * mottle)
     blood = BLOOD_MEAN * (1 + 0.35 * palm + 0.9 * tip * (0.4 + 0.6 * palm) + 0.7 * knuckle + 0.4 * crease)
     blood = blood * (1 + MOTTLE_BLOOD * mottle)
     skin = skin_color(amount, blood)
-    bed = skin_color((log_melanin.exp() * 0.5), torch.full_like(blood, 1.9 * BLOOD_MEAN))
-    nails = (1 - NAIL_WHITE) * bed + NAIL_WHITE
     shade = 1 - 0.10 * crease - 0.04 * knuckle - NAIL_RIM_SHADE * 4 * nail * (1 - nail)
-    return ((1 - nail[:, None]) * skin + nail[:, None] * nails) * shade[:, None]
+    return ((1 - nail[:, None]) * skin + nail[:, None] * nail_color(smooth)) * shade[:, None]
 
 
 def region_masks(regions: Regions) -> dict[str, Float[Tensor, "V"]]:

@@ -15,9 +15,9 @@ from oasis_warp.avatar.vertex_light import (
     WEAK,
     Lighting,
     SurfaceLight,
-    eye_from,
-    kernels_take,
+    kernels_can_run,
     lighting,
+    offset_to_camera,
     vertex_light,
     view_shares,
 )
@@ -114,7 +114,7 @@ def lit(
 ) -> Float[Tensor, "*B N 3"]:  # fmt: skip
     """`lit_in_steps`, in one kernel where no gradient is asked."""
     angles = None if bend is None else bend.angles
-    if not kernels_take(of_vertices, canonical.colors, canonical.shade, angles):
+    if not kernels_can_run(of_vertices, canonical.colors, canonical.shade, angles):
         return lit_in_steps(canonical, of_vertices, corners, bend, posed)
     folds = creases = None
     if bend is not None:
@@ -231,7 +231,7 @@ def pose_gaussians(
         on = lighting(posed_vertices, vertex_quats, light.normals, light.light, closeness)
         viewed = None
         if light.photo_eye is not None and center is not None:
-            viewed = view_shares(light.photo_eye, eye_from(posed_vertices, center))
+            viewed = view_shares(light.photo_eye, offset_to_camera(posed_vertices, center))
         elif light.photo_eye is not None:
             beside = torch.eye(1, 2, dtype=means.dtype, device=means.device)[0]
             viewed = beside.expand(*posed_vertices.shape[:-2], 2)

@@ -116,12 +116,12 @@ def with_photo(
 
     With the `center` of the photo's camera, for pictures from other sides.
     """
-    eye = None if center is None or light.facing is None else eye_from(photo, center)
+    eye = None if center is None or light.facing is None else offset_to_camera(photo, center)
     seen = None if light.shade is None else posed_lighting(rest, photo, faces, light).exposure
     return SurfaceLight(light, surface.vertex_normals(rest, faces), None if seen is None else seen[..., 0], eye)
 
 
-def eye_from(vertices: Float[Tensor, "*B V 3"], center: Float[Tensor, "3"]) -> Float[Tensor, "*B 3"]:
+def offset_to_camera(vertices: Float[Tensor, "*B V 3"], center: Float[Tensor, "3"]) -> Float[Tensor, "*B 3"]:
     """From the middle of the posed hand to a camera at `center`."""
     return center - vertices.mean(-2)
 
@@ -199,12 +199,12 @@ def vertex_light(
     light: HandLight, on: Lighting, seen: Float[Tensor, "V"] | None = None, viewed: Float[Tensor, "*B 2"] | None = None
 ) -> Float[Tensor, "*B V 5"]:
     """`vertex_light_in_steps`, in one kernel where no gradient is asked."""
-    if kernels_take(on.normals, viewed, *light):
+    if kernels_can_run(on.normals, viewed, *light):
         return _vertex_light_at_once(light, on, seen, viewed)
     return vertex_light_in_steps(light, on, seen, viewed)
 
 
-def kernels_take(*tensors: Tensor | None) -> bool:
+def kernels_can_run(*tensors: Tensor | None) -> bool:
     """Whether the kernels of light take these: they are float32, and have no gradients."""
     given = [tensor for tensor in tensors if tensor is not None]
     asked = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in given)

@@ -18,6 +18,7 @@ from oasis_warp.avatar.sky import sky_mesh, studio_light
 from oasis_warp.avatar.vertex_light import GAMMA, SurfaceLight
 from oasis_warp.core import surface
 from oasis_warp.core.camera import ORBIT_FIELD_OF_VIEW, ORBIT_MARGIN
+from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.mirror import mirror_points
 from oasis_warp.core.types import Gaussians, HandPose
@@ -255,7 +256,7 @@ def _fold_arrays(folds: Folds, creases: Creases, count: int) -> dict[str, np.nda
     joints = folds.joints.new_full((count, 2), NO_JOINT).index_copy(0, folds.index, folds.joints)
     joints = joints.index_fill(0, creases.index, STRETCH)
     return {
-        "folds": _pack(change, "i1", 1.0), "foldJoints": _numpy(joints, "u1"), "foldBetween": _pack(between, "u1", 1.0)
+        "folds": _pack(change, "i1"), "foldJoints": _numpy(joints, "u1"), "foldBetween": _pack(between, "u1", 1.0)
     }  # fmt: skip
 
 
@@ -264,11 +265,20 @@ def _numpy(values: Tensor, kind: str) -> np.ndarray:
 
 
 def _pack(values: Tensor, kind: str, most: float | None = None) -> Packed:
-    """Whole numbers up to the largest that `kind` holds, for `most`, or else the largest value."""
-    array = values.detach().cpu().double().numpy()
+    """Whole numbers up to the largest that `kind` holds, for `most`, or else the largest value.
+
+    Raises:
+        InputError: values lie beyond the numbers that `kind` holds, or are not finite.
+    """
+    array, limits = values.detach().cpu().double().numpy(), np.iinfo(kind)
     largest = float(np.abs(array).max(initial=0)) if most is None else most
-    step = largest / np.iinfo(kind).max if largest else 1.0
-    return Packed(np.rint(array / step).astype(f"<{kind}"), step)
+    step = largest / limits.max if largest else 1.0
+    numbers = np.rint(array / step)
+    if not ((numbers >= limits.min) & (numbers <= limits.max)).all():
+        expected = f"{limits.min * step:g} to {limits.max * step:g}"
+        got = f"{array.min():g} to {array.max():g}"
+        raise InputError(f"page: expected values from {expected}, got {got}; reconstruct the avatar again.")
+    return Packed(numbers.astype(f"<{kind}"), step)
 
 
 def _weights(weights: Tensor) -> Packed:

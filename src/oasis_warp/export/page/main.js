@@ -21,14 +21,15 @@ function start() {
   return new Promise((resolve, reject) => {
     worker.onerror = (event) => reject(new Problem(event.message || "The page's worker does not start in this browser."));
     worker.onmessage = ({ data }) => {
-      if (data.failed) return reject(new Problem(data.failed));
+      if (data.failed) return reject(new Problem(`The hand could not be opened (${data.failed}); export it again.`));
       byId("status").textContent = drawing.note;
       const viewer = makeViewer(byId("canvas"), data.opened, worker, drawing);
       viewer.player = fillPanel(viewer);
       listenToGestures(viewer);
       if (matchMedia("(max-width: 46rem)").matches) byId("fold").click();
-      viewer.first = () => {
+      viewer.first = (error) => {
         viewer.first = null;
+        if (error) return reject(error);
         performance.mark("first-picture");
         resolve(viewer);
       };
@@ -51,4 +52,4 @@ window.oasis.ready.then((viewer) => {
     const angles = viewer.facts.poses.find(({ name }) => name === pose)?.angles;
     return takePicture(viewer, { angles, ...options });
   };
-}, () => {});
+}, fail);

@@ -89,10 +89,15 @@ function pixelsOf({ clear, sums, width, height }, { opaque, cover }) {
 if (typeof WorkerGlobalScope !== "undefined") {
   let raster = null;
   self.onmessage = ({ data: { ellipses, count, hurry, width, height } }) => {
-    if (raster?.width !== width || raster?.height !== height) raster = makeRaster(width, height);
-    const how = hurry ? HURRIED : EXACT;
-    drawEllipses(raster, ellipses, count, how);
-    const pixels = pixelsOf(raster, how);
-    self.postMessage(pixels, [pixels.buffer]);
+    try {
+      if (raster?.width !== width || raster?.height !== height) raster = makeRaster(width, height);
+      const how = hurry ? HURRIED : EXACT;
+      drawEllipses(raster, ellipses, count, how);
+      const pixels = pixelsOf(raster, how);
+      self.postMessage({ pixels }, [pixels.buffer]);
+    } catch (error) {
+      console.error(error);
+      self.postMessage({ failed: String(error.message ?? error) });
+    }
   };
 }

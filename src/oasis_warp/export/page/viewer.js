@@ -12,10 +12,10 @@ function makeViewer(canvas, facts, worker, { draw, facing }) {
     wishes: new Map(), wanted: false, waiting: 0, next: 1, scale: 1, moving: 0, shown: 0, times: [],
   };
   worker.onmessage = ({ data }) => {
-    if (data.failed) throw new Problem(data.failed);
-    const wish = viewer.wishes.get(data.id);
+    const { resolve, reject } = viewer.wishes.get(data.id);
     viewer.wishes.delete(data.id);
-    wish(data);
+    if (data.failed) reject(notDrawn(data.failed));
+    else resolve(data);
   };
   new ResizeObserver(() => show(viewer)).observe(canvas);
   canvas.addEventListener("forgotten", () => show(viewer));
@@ -26,6 +26,8 @@ function makeViewer(canvas, facts, worker, { draw, facing }) {
 
 class Problem extends Error {}
 
+const notDrawn = (reason) => new Problem(`A picture could not be drawn (${reason}); choose another, or load the page again.`);
+
 const homeCamera = () => ({ azimuth: 0, elevation: 0, zoom: 1, shift: [0, 0] });
 
 // Ask for a new picture of what is wanted now.
@@ -34,7 +36,7 @@ function show(viewer, moving = false) {
   if (moving) viewer.moving = performance.now();
 }
 
-// At most two pictures are under way: one is posed while the one before is drawn.
+// At most two pictures are under way: one is posed while the one before is drawn. main.js says which fail.
 function step(viewer) {
   const now = performance.now();
   viewer.tick?.(now);
@@ -43,7 +45,10 @@ function step(viewer) {
   if (!viewer.wanted || viewer.waiting >= 2) return;
   viewer.wanted = false;
   viewer.waiting++;
-  paint(viewer).finally(() => viewer.waiting--);
+  paint(viewer).finally(() => viewer.waiting--).catch((error) => {
+    if (!viewer.first) throw error;
+    viewer.first(error);
+  });
 }
 
 async function paint(viewer) {
@@ -70,9 +75,9 @@ function countPicture(viewer) {
 }
 
 function ask(viewer, camera, look, angles, hurry = false) {
-  return new Promise((resolve) => {
+  return new Promise((resolve, reject) => {
     const id = viewer.next++;
-    viewer.wishes.set(id, resolve);
+    viewer.wishes.set(id, { resolve, reject });
     viewer.worker.postMessage({ id, camera, look, angles, hurry, facing: viewer.facing });
   });
 }

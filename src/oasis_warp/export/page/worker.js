@@ -69,7 +69,8 @@ if (typeof self !== "undefined" && typeof WorkerGlobalScope !== "undefined") {
       const took = performance.now() - start;
       self.postMessage({ id: message.id, ellipses, count, hurry: message.hurry && Boolean(hand.body), took }, [ellipses.buffer]);
     } catch (error) {
-      self.postMessage({ failed: String(error.stack ?? error) });
+      console.error(error);
+      self.postMessage({ id: message.id, failed: String(error.message ?? error) });
     }
   };
 }
