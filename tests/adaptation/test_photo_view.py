@@ -3,6 +3,7 @@ import math
 import pytest
 import torch
 from synthetic import crop_of
+from torch.nn.functional import interpolate
 
 from oasis_warp.adaptation.photo_view import _skin_alone, match_photos
 from oasis_warp.avatar.anchors import vertex_to_gaussians
@@ -10,7 +11,7 @@ from oasis_warp.avatar.appearance import label_regions, region_colors
 from oasis_warp.avatar.observation import inner_mask, observe
 from oasis_warp.avatar.pose import pose_gaussians, shading_factors
 from oasis_warp.avatar.vertex_light import posed_lighting
-from oasis_warp.core.camera import orbit_camera
+from oasis_warp.core.camera import crop_camera, orbit_camera
 from oasis_warp.core.types import HandLight
 from oasis_warp.losses import masked_psnr
 from oasis_warp.render import render
@@ -52,6 +53,22 @@ def test_what_the_skin_does_not_explain_is_in_the_photos_view_and_is_shade(hand,
     )
     assert before < 25 and after > before + 8
     assert torch.equal(matched.colors, gaussians.colors)
+
+
+def test_skin_between_the_photos_pixels_is_matched_too(hand, scene):
+    """Along outlines that fall between pixels, Gaussians kept what they had: thin bright lines in larger pictures."""
+    _, _, light = scene
+    crop, truth, _ = crop_of(hand, 0.6 * region_colors(label_regions(hand), 0.03), size=128, pose_name="fist")
+    facing = posed_lighting(crop.rest.vertices, crop.posed.vertices, hand.faces, light).normals
+    light, truth = light._replace(facing=facing), truth._replace(shade=torch.ones_like(truth.colors))
+    crop = crop._replace(image=drawn_as_photo(hand, truth, crop, light))
+    fingers = vertex_to_gaussians((hand.segment > 0).float()[:, None].expand(-1, 3), hand.faces, truth)
+    matched = match_photos(hand, truth._replace(shade=1 + 0.6 * fingers), [crop], [light], ONE)
+    large = crop._replace(camera=crop_camera(crop.camera, 0.0, 0.0, 128.0, 512))
+    drawn, wanted = (drawn_as_photo(hand, each, large, light) for each in (matched, truth))
+    inside = inner_mask(interpolate(crop.mask[None, None], (512, 512))[0, 0], 12) > 0.9
+    too_bright = (drawn > 1.2 * wanted).all(-1)[inside].float().mean()
+    assert int(inside.sum()) > 20000 and float(too_bright) < 5e-4
 
 
 def test_no_rim_of_the_room_behind_the_hand_is_left(hand, scene):

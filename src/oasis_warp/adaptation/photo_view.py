@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from oasis_warp.adaptation.sharpen import lit_as_photo
 from oasis_warp.adaptation.unlit import MIN_ALPHA
@@ -19,6 +20,7 @@ from oasis_warp.avatar.anchors import rim_fade, vertex_to_gaussians
 from oasis_warp.avatar.densify import Densified
 from oasis_warp.avatar.pose import pose_gaussians, with_shade_baked
 from oasis_warp.avatar.vertex_light import posed_lighting
+from oasis_warp.core.camera import crop_camera
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandLight
 from oasis_warp.ops import BlendWeights, blend_colors
@@ -33,6 +35,9 @@ SOFT = 2 / 256
 """Standard deviation of the blur of the skin that they take, as a share of the crop's side."""
 UNSURE = 0.6
 """Weight of these pixels at the border and outside; inside it grows to 1, that of sure ones."""
+FINER, LARGEST = 2, 768
+"""How many times as fine as the photo pictures are matched first, up to so many pixels a side. Of outlines that fall
+between the photo's pixels thin bright lines were left in finer pictures."""
 WRIST = 0.02
 """Distance from the wrist's end up to which nothing changes, and over which the change grows [m]."""
 FEWEST, HARDLY_SEEN = 0.05, 1.0
@@ -78,6 +83,16 @@ def match_photos(
         lights: Light of each.
         gains: How many times as bright as the first each is.
     """
+    finer = [_enlarged(crop) for crop in crops]
+    if any(len(large.mask) > len(crop.mask) for large, crop in zip(finer, crops, strict=True)):
+        gaussians = _match_once(hand, gaussians, finer, lights, gains)
+    return _match_once(hand, gaussians, crops, lights, gains)
+
+
+def _match_once(
+    hand: HandModel, gaussians: CanonicalGaussians, crops: Sequence[HandCrop], lights: Sequence[HandLight],
+    gains: Float[Tensor, "K 3"],
+) -> CanonicalGaussians:  # fmt: skip
     if gaussians.shade is None:
         return gaussians
     rest, faces, views = crops[0].rest.vertices, hand.faces.to(crops[0].image.device), []
@@ -122,6 +137,19 @@ def keep_pictures(
     share = vertex_to_gaussians(openly, faces, made) if made.shade is not None else 1
     changed = made._replace(colors=(made.colors * (share * logs).exp()).clamp(0, 1))
     return changed if made.shade is None else changed._replace(shade=made.shade * ((1 - share) * logs).exp())
+
+
+def _enlarged(crop: HandCrop) -> HandCrop:
+    """The same photo with finer pixels in between; itself from `LARGEST` on."""
+    size = min(FINER * len(crop.mask), LARGEST)
+    if size <= len(crop.mask):
+        return crop
+    planes = torch.cat([crop.image, crop.mask[..., None], crop.above_wrist[..., None]], -1).permute(2, 0, 1)[None]
+    planes = interpolate(planes, (size, size), mode="bicubic", align_corners=False)[0].permute(1, 2, 0).clamp(0, 1)
+    return crop._replace(
+        image=planes[..., :3], mask=planes[..., 3], above_wrist=planes[..., 4],
+        camera=crop_camera(crop.camera, 0.0, 0.0, float(len(crop.mask)), size),
+    )  # fmt: skip
 
 
 def _skin_alone(crop: HandCrop) -> tuple[Float[Tensor, "S S 3"], Float[Tensor, "S S 1"]]:
