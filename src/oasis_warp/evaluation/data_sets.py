@@ -4,6 +4,7 @@ A data set has many pictures of few people, each with the hand that its annotati
 become avatars, evenly spaced over all, and for each of them others are compared with, evenly spaced too.
 """
 
+import hashlib
 import json
 import math
 import os
@@ -62,8 +63,9 @@ class Key(NamedTuple):
 
     @property
     def file(self) -> str:
-        """What its files are called."""
-        return re.sub(r"[^\w.-]+", "-", self.name)
+        """What its files are called: as the picture, or with a digest of its name where that is no name of a file."""
+        plain = re.sub(r"[^\w.-]+", "-", self.name)
+        return plain if plain == self.name else f"{plain}-{hashlib.sha256(self.name.encode()).hexdigest()[:8]}"
 
 
 class Sample(NamedTuple):

@@ -13,7 +13,7 @@ from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.data.output_files import open_resumable_folder, write_file
+from oasis_warp.data.output_files import check_apart, open_resumable_folder, write_file
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.evaluation.band_energy import BANDS
@@ -74,11 +74,14 @@ def evaluate_looks(
         progress: Called for photos.
 
     Raises:
-        InputError: a folder that cannot be used, or no photo of which an avatar can be made.
+        InputError: a folder that cannot be used, photos that differ only in their ending, or no photo of which an
+            avatar can be made.
     """
     if not folder.is_dir() or not (photos := photos_in(folder)):
         raise InputError(f"{folder}: expected a folder with photos of hands, found none there.")
     groups = real_photos(folder)
+    check_apart(photos, [path.stem for path in photos], "record", "rename one of them")
+    check_apart(list(groups), [real_name(path, hand) for path, hand in groups.items()], "record", "rename one of them")
     settings = {
         "version": __version__, "prior": {"name": prior.about["name"], "weights": prior_digest(prior)},
         "photos": [path.name for path in photos], "real": [path.name for path in groups],
@@ -120,6 +123,11 @@ def hand_of(path: Path, groups: Mapping[Path, str]) -> str:
     return next(same, path.stem)
 
 
+def real_name(path: Path, hand: str) -> str:
+    """Name of the record of a real photo."""
+    return f"{hand}_{path.stem}"
+
+
 def measure_all_real(
     groups: Mapping[Path, str], folder: Path, progress: Progress = silent
 ) -> tuple[list[Record], dict[str, str]]:
@@ -128,7 +136,7 @@ def measure_all_real(
     for k, (path, hand) in enumerate(groups.items()):
         progress("real hands", k, len(groups))
         name = f"{hand}/{path.name}"
-        file = folder / f"{hand}_{path.stem}.json"
+        file = folder / f"{real_name(path, hand)}.json"
         record = read_result(file, ("hand", "mostly", "features"))
         if record is None:
             try:
