@@ -1,4 +1,6 @@
-"""Records that an evaluation keeps and goes on from: each is of one photo."""
+"""Records that an evaluation keeps and goes on from: each is of one photo, and of the settings that are noted."""
+
+from types import MappingProxyType
 
 import pytest
 import torch
@@ -7,7 +9,7 @@ from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.data.pictures import write_picture
-from oasis_warp.evaluation import looks
+from oasis_warp.evaluation import data_sets, looks, same_hand
 from oasis_warp.evaluation.data_sets import Key
 
 
@@ -51,3 +53,44 @@ def test_pictures_of_a_data_set_have_files_of_their_own_and_plain_names_are_kept
     files = [Key("a", name).file for name in names]
     assert len(set(files)) == len(names) and all("/" not in file and " " not in file for file in files)
     assert files[1] == names[1] and files[4] == names[4]
+
+
+class Stop(Exception):
+    """With the options that an evaluation hands on."""
+
+
+@pytest.mark.parametrize("evaluation", ["looks", "same-hand", "data set"])
+def test_options_that_are_not_noted_with_the_records_do_not_reach_the_avatars(
+    hand, photos, tmp_path, monkeypatch, evaluation
+):
+    """A run could go on with the records of another: only what is noted is compared when it is started again."""
+
+    def stop(*given, **_):
+        raise Stop(next(part for part in given if isinstance(part, ReconstructConfig)))
+
+    noted = {"steps": 3, "seed": 5}
+    others = {"light": "keep", "unseen": "plain", "adapt": "lora", "force": True, "refine": "on", "hand": "left"}
+    config, folder = ReconstructConfig(**noted, **others, size=64), photos("a.png", "b.png")
+    monkeypatch.setattr(looks, "measure_all_real", lambda *_: ([], {}))
+    monkeypatch.setattr(looks, "reconstruct", stop)
+    monkeypatch.setattr(same_hand, "_measure_hand", stop)
+    monkeypatch.setattr(data_sets, "_Measuring", stop)
+    with pytest.raises(Stop) as stopped:
+        if evaluation == "looks":
+            looks.evaluate_looks(MeanPrior(hand), folder, tmp_path / "out", config)
+        elif evaluation == "same-hand":
+            same_hand.evaluate_photos({}, folder, tmp_path / "out", config)
+        else:
+            data_sets.evaluate_data_set(NoPictures(), {}, [], data_sets.Choice(), tmp_path / "out", config=config)
+    size = {"size": 64} if evaluation == "same-hand" else {}
+    expected = ReconstructConfig() if evaluation == "data set" else ReconstructConfig(**noted, **size)
+    assert stopped.value.args == (expected,)
+
+
+class NoPictures:
+    """A data set without pictures."""
+
+    keys, left_out = (), MappingProxyType({})
+
+    def read(self, key):
+        raise AssertionError(key)

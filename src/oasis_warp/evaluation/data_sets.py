@@ -165,6 +165,7 @@ def evaluate_data_set(
     Raises:
         InputError: a folder that cannot be used, or no picture that an avatar could be made of.
     """
+    config = ReconstructConfig(hand_model=config.hand_model, mano_dir=config.mano_dir, device=config.device)
     settings = {
         "version": __version__, "priors": {name: prior_digest(prior) for name, prior in priors.items()},
         "lpips": perceptual is not None, "hand_model": config.hand_model, **asdict(choice),

@@ -74,18 +74,15 @@ def evaluate_looks(
         progress: Called for photos.
 
     Raises:
-        InputError: a folder that cannot be used, photos that differ only in their ending, or no photo of which an
-            avatar can be made.
+        InputError: a folder that cannot be used, or no photo of which an avatar can be made.
     """
-    if not folder.is_dir() or not (photos := photos_in(folder)):
-        raise InputError(f"{folder}: expected a folder with photos of hands, found none there.")
-    groups = real_photos(folder)
-    check_apart(photos, [path.stem for path in photos], "record", "rename one of them")
-    check_apart(list(groups), [real_name(path, hand) for path, hand in groups.items()], "record", "rename one of them")
+    photos, groups = find_photos(folder)
+    noted = {"steps": config.steps, "seed": config.seed}
+    config = ReconstructConfig(**noted, device=config.device)
     settings = {
         "version": __version__, "prior": {"name": prior.about["name"], "weights": prior_digest(prior)},
         "photos": [path.name for path in photos], "real": [path.name for path in groups],
-        "lpips": perceptual is not None, **{name: getattr(config, name) for name in ("steps", "seed")},
+        "lpips": perceptual is not None, **noted,
     }  # fmt: skip
     open_resumable_folder(out, SETTINGS, settings, "an evaluation")
     for inner in (AVATARS, REAL, SHEETS):
@@ -114,6 +111,21 @@ def evaluate_looks(
     }  # fmt: skip
     write_file(out / METRICS, json.dumps(whole, allow_nan=False).encode())
     return whole
+
+
+def find_photos(folder: Path) -> tuple[list[Path], dict[Path, str]]:
+    """The photos of which avatars are made, and those of real hands with the hand that each one shows.
+
+    Raises:
+        InputError: there is none, or the records of two would have one name.
+    """
+    if not folder.is_dir() or not (photos := photos_in(folder)):
+        raise InputError(f"{folder}: expected a folder with photos of hands, found none there.")
+    groups = real_photos(folder)
+    names = [real_name(path, hand) for path, hand in groups.items()]
+    check_apart(photos, [path.stem for path in photos], "record", "rename one of them")
+    check_apart(list(groups), names, "record", "rename one of them")
+    return photos, groups
 
 
 def hand_of(path: Path, groups: Mapping[Path, str]) -> str:
