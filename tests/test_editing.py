@@ -123,6 +123,15 @@ def test_a_photo_without_paint_is_refused(truth):
         edit(truth.avatar, truth.photo, photo=truth.photo)
 
 
+def test_another_mistake_on_the_way_is_not_said_to_be_a_lack_of_paint(truth, painted, monkeypatch):
+    def fail(*_):
+        raise ValueError("pose.angles: expected finite values, got nan.")
+
+    monkeypatch.setattr(editing, "skin", fail)
+    with pytest.raises(ValueError, match=r"^pose\.angles: expected finite values"):
+        edit(truth.avatar, painted, photo=truth.photo, config=QUICK)
+
+
 def test_a_wholly_different_picture_is_not_said_to_lack_paint(truth):
     noise = torch.randint(0, 256, truth.photo.rgb.shape, generator=torch.Generator().manual_seed(0)).to(torch.uint8)
     other = truth.photo._replace(rgb=noise, name="other.png")

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.adaptation.repaint import RepaintResult, find_paint, match_size, read_mask, repaint
+from oasis_warp.adaptation.repaint import NoPaintError, RepaintResult, find_paint, match_size, read_mask, repaint
 from oasis_warp.adaptation.reprojection import Canvas
 from oasis_warp.adaptation.sh_lighting import without_light
 from oasis_warp.core.camera import crop_camera
@@ -102,7 +102,7 @@ def edit(
         canvas = _right_handed(avatar, shown, share, size)
         try:
             painting = _repaint(avatar, canvas, config.steps, progress)
-        except ValueError as error:
+        except NoPaintError as error:
             where = "on the hand" if mask else "on the hand that differs from the photo"
             message = f"{painted.name}: there is no paint {where}; paint on the hand, or give a mask."
             raise InputError(message) from error
