@@ -14,6 +14,7 @@ from oasis_warp.core.camera import project
 from oasis_warp.core.config import BLACK, EditConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import HandLight, Photo
+from oasis_warp.data.pictures import write_picture
 from oasis_warp.data.square_crop import find_square
 from oasis_warp.editing import edit
 from oasis_warp.hand_avatar import Avatar
@@ -89,6 +90,15 @@ def test_a_mask_replaces_the_photo(truth, chart, painted, made):
     assert masked.square.side == pytest.approx(made.square.side, rel=0.005)
     assert masked.measures["painted_mm2"] < made.measures["painted_mm2"]  # the difference has a rim around it
     assert masked.measures["input_psnr_db"] > 16
+
+
+def test_photos_may_be_given_as_files_as_to_reconstruct(truth, painted, made, tmp_path, as_shipped):
+    for name, photo in (("painted.png", painted), ("photo.png", truth.photo)):
+        write_picture(tmp_path / name, photo.rgb)
+    found = edit(truth.avatar, str(tmp_path / "painted.png"), photo=tmp_path / "photo.png", config=QUICK)
+    assert torch.equal(found.avatar.gaussians.colors, made.avatar.gaussians.colors)
+    with pytest.raises(TypeError, match="^mask: expected a Photo or its file, got int"):
+        edit(truth.avatar, tmp_path / "painted.png", mask=3)
 
 
 def test_a_transparent_layer_is_paint(truth, chart, made):

@@ -15,7 +15,6 @@ from oasis_warp.cli.progress import (
     INTERRUPTED,
     Run,
     Terminal,
-    check_device,
     plain_console,
     reconstruct_plan,
     show_run,
@@ -24,6 +23,7 @@ from oasis_warp.cli.record import written
 from oasis_warp.cli.report import make_report, print_report, to_json
 from oasis_warp.cli.summary import GROUND, draw_quality, draw_summary
 from oasis_warp.core.config import ReconstructConfig, check_config
+from oasis_warp.core.devices import check_device
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent, timed_stage
 from oasis_warp.core.processes import single_threaded_math
@@ -46,7 +46,7 @@ def run(options: Reconstruct) -> int:
     Raises:
         InputError: an option is wrong, or the one photo cannot be turned into an avatar.
     """
-    check_device(options.device)
+    check_device(options.device, "--")
     _check_photos(options)
     config = ReconstructConfig(**{field.name: getattr(options, field.name) for field in fields(ReconstructConfig)})
     check_config(config, "--")
