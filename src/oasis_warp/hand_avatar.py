@@ -325,7 +325,7 @@ class Avatar:
         The photo's shade stays where skin faces as in the photo. Light that is part of the colours stays too.
 
         Args:
-            harmonics: Result of `avatar.sky.environment_light` or `studio_light`, in the photo's camera's world.
+            harmonics: Result of `oasis_warp.environment_light` or `studio_light`, in the photo's camera's world.
         """
         level = self.shape.new_ones(3) if self.light is None else self.light.even
         around = harmonics.to(level) * level.mean()
