@@ -14,6 +14,7 @@ from oasis_warp.core.camera import project
 from oasis_warp.core.config import BLACK, EditConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import HandLight, Photo
+from oasis_warp.data.pictures import write_picture
 from oasis_warp.data.square_crop import find_square
 from oasis_warp.editing import edit
 from oasis_warp.hand_avatar import Avatar
@@ -91,6 +92,15 @@ def test_a_mask_replaces_the_photo(truth, chart, painted, made):
     assert masked.measures["input_psnr_db"] > 16
 
 
+def test_photos_may_be_given_as_files_as_to_reconstruct(truth, painted, made, tmp_path, as_shipped):
+    for name, photo in (("painted.png", painted), ("photo.png", truth.photo)):
+        write_picture(tmp_path / name, photo.rgb)
+    found = edit(truth.avatar, str(tmp_path / "painted.png"), photo=tmp_path / "photo.png", config=QUICK)
+    assert torch.equal(found.avatar.gaussians.colors, made.avatar.gaussians.colors)
+    with pytest.raises(TypeError, match="^mask: expected a Photo or its file, got int"):
+        edit(truth.avatar, tmp_path / "painted.png", mask=3)
+
+
 def test_a_transparent_layer_is_paint(truth, chart, made):
     share = mask_of(chart).rgb[..., 0].float() / 255
     layer = Photo(torch.full((224, 224, 3), 30, dtype=torch.uint8), share, None, "layer.png", 1.0)
@@ -121,6 +131,15 @@ def test_without_photo_and_mask_nothing_is_guessed(truth, painted):
 def test_a_photo_without_paint_is_refused(truth):
     with pytest.raises(InputError, match="there is no paint on the hand that differs from the photo"):
         edit(truth.avatar, truth.photo, photo=truth.photo)
+
+
+def test_another_mistake_on_the_way_is_not_said_to_be_a_lack_of_paint(truth, painted, monkeypatch):
+    def fail(*_):
+        raise ValueError("pose.angles: expected finite values, got nan.")
+
+    monkeypatch.setattr(editing, "skin", fail)
+    with pytest.raises(ValueError, match=r"^pose\.angles: expected finite values"):
+        edit(truth.avatar, painted, photo=truth.photo, config=QUICK)
 
 
 def test_a_wholly_different_picture_is_not_said_to_lack_paint(truth):

@@ -252,6 +252,13 @@ def test_replayed_pictures_are_the_drawn_ones_at_every_size_and_distance(side, l
             assert torch.equal(replayed.image, drawn.image) and torch.equal(replayed.alpha, drawn.alpha)
 
 
+def test_a_device_that_is_not_there_is_refused_before_the_file_is_read(tmp_path, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    for device in ("cuda", torch.device("cuda:1")):
+        with pytest.raises(InputError, match=rf"^device {device}: torch finds no CUDA device; use device cpu"):
+            Avatar.load(tmp_path / "none.safetensors", device)
+
+
 @pytest.mark.gpu
 def test_pictures_of_a_gpu_can_be_drawn_in_inference_mode_and_out_of_it(right, tmp_path):
     right.save(tmp_path / "a.safetensors")

@@ -1,5 +1,6 @@
 """What users import, what is imported for what, and what ships beside us: licences, safe versions, no network."""
 
+import importlib
 import json
 import os
 import re
@@ -24,6 +25,17 @@ def test_every_public_name_has_a_home_and_a_docstring(name):
 
 def test_the_list_of_names_is_the_table_of_homes():
     assert sorted(oasis_warp.__all__) == sorted(oasis_warp._HOMES)
+
+
+def test_every_name_of_the_api_reference_is_in_the_module_that_it_is_attributed_to():
+    """`watch_overflow` was listed in `oasis_warp.ops`, but was only in a private module."""
+    text = (Path(__file__).parents[1] / "docs" / "api.md").read_text()
+    names = re.findall(r"^\.\. auto(?:function|class|exception|data):: ([\w.]+)$", text, re.MULTILINE)
+    for module, members in re.findall(r"^\.\. automodule:: ([\w.]+)\n   :members: (.+)$", text, re.MULTILINE):
+        names += [f"{module}.{member}" for member in members.split(", ")]
+    homes = [name.rpartition(".")[::2] for name in names]
+    assert [name for module, name in homes if not hasattr(importlib.import_module(module), name)] == []
+    assert {name for module, name in homes if module == "oasis_warp"} == set(oasis_warp.__all__)
 
 
 def test_an_unknown_name_is_an_attribute_error():

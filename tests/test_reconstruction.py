@@ -4,6 +4,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from synthetic import crop_of
@@ -17,7 +18,7 @@ from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.avatar.quality import over_photo
 from oasis_warp.core.camera import orbit_camera, project
-from oasis_warp.core.config import PAPER_ADAPTATION, AdaptConfig, ReconstructConfig
+from oasis_warp.core.config import PAPER_ADAPTATION, AdaptConfig, ReconstructConfig, check_config
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.mirror import mirror_pose
 from oasis_warp.core.processes import using_threads
@@ -72,19 +73,59 @@ def test_no_photo_is_an_error_of_the_caller():
 
 
 @pytest.mark.parametrize(("options", "message"), [
-    ({"light": "nope"}, "light nope: expected one of fit, keep, even"),
-    ({"refine": "nope"}, "refine nope: expected one of on, off"),
-    ({"adapt": "nope"}, "adapt nope: expected one of field, lora"),
+    ({"light": "nope"}, "light 'nope': expected 'fit' or 'keep' or 'even'"),
+    ({"light": None}, "light None: expected 'fit' or 'keep' or 'even'"),
+    ({"refine": "nope"}, "refine 'nope': expected 'on' or 'off'"),
+    ({"adapt": "nope"}, "adapt 'nope': expected 'field' or 'lora'"),
     ({"steps": -1}, "steps -1: expected 0 or more"),
     ({"size": 3}, "size 3: expected 64 to 1024 pixels"),
     ({"size": 99999}, "size 99999: expected 64 to 1024 pixels"),
+    ({"size": "512"}, "size '512': expected an integer or 'auto'; choose another value."),
+    ({"size": 512.5}, "size 512.5: expected an integer or 'auto'"),
+    ({"size": None}, "size None: expected an integer or 'auto'"),
+    ({"hand": "both"}, "hand 'both': expected an integer or 'left' or 'right' or 'largest'"),
+    ({"steps": 2.5}, "steps 2.5: expected an integer; choose"),
+    ({"seed": "1"}, "seed '1': expected an integer"),
 ])  # fmt: skip
 def test_options_are_checked_before_any_work_from_python_too(options, message):
+    with pytest.raises(InputError, match=message):
+        reconstruct("there is no such file.jpg", unchecked(options))
+
+
+def unchecked(options):
+    """Options as without the type checker of these tests."""
     config = ReconstructConfig()
     for name, value in options.items():
-        object.__setattr__(config, name, value)  # as without the type checker of these tests
-    with pytest.raises(InputError, match=message):
-        reconstruct("there is no such file.jpg", config)
+        object.__setattr__(config, name, value)
+    return config
+
+
+def test_numbers_of_numpy_are_integers_too():
+    check_config(unchecked({"size": np.int64(512), "seed": np.uint8(3), "hand": 1}))
+    with pytest.raises(InputError, match="size 3: expected 64 to 1024 pixels"):
+        check_config(unchecked({"size": np.int64(3)}))
+
+
+@pytest.mark.parametrize("make", [reconstruct, lambda photo, config: reconstruct_same_hand([photo], config)])
+def test_a_device_that_is_not_there_is_refused_as_on_the_command_line(make, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(InputError, match="^device cuda: torch finds no CUDA device; use device cpu, or see `oasis doc"):
+        make("there is no such file.jpg", ReconstructConfig(device="cuda"))
+
+
+def test_what_is_no_photo_is_refused_in_a_sentence(as_shipped):
+    pixels = np.zeros((64, 64, 3), np.uint8)
+    with pytest.raises(TypeError, match="^photo: expected a Photo or its file, got ndarray; save the picture and give"):
+        reconstruct(pixels)
+    with pytest.raises(TypeError, match=r"^photo: expected a Photo or its file, got ndarray"):
+        reconstruct_same_hand([PALM, pixels])
+
+
+@pytest.mark.parametrize("alone", ["x.png", Path("x.png"), Photo(torch.zeros(0, 0, 3).byte(), None, None, "x", 1.0)])
+def test_one_photo_is_no_list_of_photos(alone, as_shipped):
+    said = rf"^photos: expected a list, got one {type(alone).__name__}; put it in brackets, \[photo\]\.$"
+    with pytest.raises(TypeError, match=said):
+        reconstruct_same_hand(alone)
 
 
 def test_lora_is_for_one_photo():

@@ -6,12 +6,16 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.2.0"
 
 if TYPE_CHECKING:
+    from oasis_warp.avatar.sky import environment_light as environment_light
+    from oasis_warp.avatar.sky import studio_light as studio_light
     from oasis_warp.core.config import EditConfig as EditConfig
     from oasis_warp.core.config import ReconstructConfig as ReconstructConfig
     from oasis_warp.core.errors import InputError as InputError
     from oasis_warp.core.types import Camera as Camera
     from oasis_warp.core.types import Gaussians as Gaussians
     from oasis_warp.core.types import HandPose as HandPose
+    from oasis_warp.core.types import Photo as Photo
+    from oasis_warp.data.environment_map import read_environment as read_environment
     from oasis_warp.data.photo import read_photo as read_photo
     from oasis_warp.editing import edit as edit
     from oasis_warp.hand_avatar import Avatar as Avatar
@@ -34,24 +38,29 @@ _HOMES = {
     "Gaussians": "core.types",
     "HandPose": "core.types",
     "InputError": "core.errors",
+    "Photo": "core.types",
     "ReconstructConfig": "core.config",
     "depth_map": "ops",
     "depth_visibility": "ops",
     "edit": "editing",
+    "environment_light": "avatar.sky",
     "face_rotations": "ops",
     "pose_on_mesh": "ops",
     "pose_on_mesh_covars": "ops",
     "rasterization": "ops",
+    "read_environment": "data.environment_map",
     "read_photo": "data.photo",
     "reconstruct": "reconstruction",
     "reconstruct_same_hand": "reconstruction",
     "skin": "ops",
     "spherical_harmonics": "ops",
+    "studio_light": "avatar.sky",
 }
 __all__ = [
-    "Avatar", "Camera", "EditConfig", "Gaussians", "HandPose", "InputError", "ReconstructConfig", "depth_map",
-    "depth_visibility", "edit", "face_rotations", "pose_on_mesh", "pose_on_mesh_covars", "rasterization", "read_photo",
-    "reconstruct", "reconstruct_same_hand", "skin", "spherical_harmonics",
+    "Avatar", "Camera", "EditConfig", "Gaussians", "HandPose", "InputError", "Photo", "ReconstructConfig", "depth_map",
+    "depth_visibility", "edit", "environment_light", "face_rotations", "pose_on_mesh", "pose_on_mesh_covars",
+    "rasterization", "read_environment", "read_photo", "reconstruct", "reconstruct_same_hand", "skin",
+    "spherical_harmonics", "studio_light",
 ]  # fmt: skip
 
 

@@ -1,13 +1,14 @@
 """`edit`: paint on the photo that an avatar was made from, and the avatar wears the paint. No estimator runs."""
 
-from contextlib import AbstractContextManager
+import functools
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from oasis_warp.adaptation.repaint import RepaintResult, find_paint, match_size, read_mask, repaint
+from oasis_warp.adaptation.repaint import NoPaintError, RepaintResult, find_paint, match_size, read_mask, repaint
 from oasis_warp.adaptation.reprojection import Canvas
 from oasis_warp.adaptation.sh_lighting import without_light
 from oasis_warp.core.camera import crop_camera
@@ -17,6 +18,7 @@ from oasis_warp.core.logging import Progress, silent, timed_stage
 from oasis_warp.core.mirror import mirror_camera, mirror_pose
 from oasis_warp.core.processes import single_threaded_math
 from oasis_warp.core.types import HandCrop, Photo
+from oasis_warp.data.photo import as_photo
 from oasis_warp.data.square_crop import Square, find_square, resample_square
 from oasis_warp.hand.skinning import skin
 from oasis_warp.hand_avatar import Avatar
@@ -54,10 +56,10 @@ class Edit(NamedTuple):
 @torch.no_grad()
 def edit(
     avatar: Avatar,
-    painted: Photo,
+    painted: Photo | Path | str,
     *,
-    photo: Photo | None = None,
-    mask: Photo | None = None,
+    photo: Photo | Path | str | None = None,
+    mask: Photo | Path | str | None = None,
     config: EditConfig = EditConfig(),  # noqa: B008 - frozen
     progress: Progress = silent,
 ) -> Edit:
@@ -69,8 +71,8 @@ def edit(
 
     Args:
         avatar: From `reconstruct` or `Avatar.load`; it is not changed.
-        painted: The photo with something painted on it: the whole of it, of any size. Or, where `photo` is given, a
-            picture of the paint alone, with the rest transparent.
+        painted: The photo with something painted on it, or its file: the whole of it, of any size. Or, where `photo` is
+            given, a picture of the paint alone, with the rest transparent.
         photo: The photo before. What differs from it is paint, if no `mask` says so.
         mask: White, or opaque, where there is paint.
         config: Options.
@@ -78,18 +80,19 @@ def edit(
 
     Raises:
         InputError: neither `photo` nor `mask` is given, the pictures have different proportions, they show another
-            hand, or there is no paint on it.
+            hand, or there is no paint on it. Or a wrong file.
+        TypeError: a picture is neither a photo nor a file.
     """
     check_config(config)
+    painted = as_photo(painted, "painted")
+    photo = None if photo is None else as_photo(photo)
+    mask = None if mask is None else as_photo(mask, "mask")
     if photo is None and mask is None:
         raise InputError(
             f"{painted.name}: the paint cannot be told from the photo; also give the original photo, or a mask."
         )
     stages: dict[str, float] = {}
-
-    def stage(name: str) -> AbstractContextManager[None]:
-        return timed_stage(name, stages, progress)
-
+    stage = functools.partial(timed_stage, seconds=stages, progress=progress)
     with stage("kernels"):
         warm_up(avatar.device)
     with stage("difference"):
@@ -102,7 +105,7 @@ def edit(
         canvas = _right_handed(avatar, shown, share, size)
         try:
             painting = _repaint(avatar, canvas, config.steps, progress)
-        except ValueError as error:
+        except NoPaintError as error:
             where = "on the hand" if mask else "on the hand that differs from the photo"
             message = f"{painted.name}: there is no paint {where}; paint on the hand, or give a mask."
             raise InputError(message) from error

@@ -24,6 +24,7 @@ from oasis_warp.avatar.wrist import hand_up
 from oasis_warp.core.camera import camera_center, orbit_camera
 from oasis_warp.core.color import plain_background
 from oasis_warp.core.config import WHITE
+from oasis_warp.core.devices import check_device
 from oasis_warp.core.hand_model import MANO_SHAPES, HandModel
 from oasis_warp.core.mirror import (
     mirror_camera,
@@ -334,7 +335,7 @@ class Avatar:
         The photo's shade stays where skin faces as in the photo. Light that is part of the colours stays too.
 
         Args:
-            harmonics: Result of `avatar.sky.environment_light` or `studio_light`, in the photo's camera's world.
+            harmonics: Result of `oasis_warp.environment_light` or `studio_light`, in the photo's camera's world.
 
         Raises:
             ValueError: of another shape, or not finite.
@@ -380,8 +381,10 @@ class Avatar:
             mano_dir: Folder with MANO's files, for an avatar that was made with them; see `chosen_hand`.
 
         Raises:
-            InputError: not an avatar file, damaged, of a newer version, or made with a hand model that is not here.
+            InputError: not an avatar file, damaged, of a newer version, or made with a hand model that is not here; or
+                there is no such device.
         """
+        check_device(device)
         hand = bundled_hand()
         sizes = {"S": hand.shape_basis.shape[2], "V": len(hand.template), "F": len(hand.faces)}
         tensors, header = load_avatar(Path(path), {hand.name: sizes, "mano": sizes | {"S": MANO_SHAPES}})

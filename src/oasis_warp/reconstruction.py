@@ -34,14 +34,15 @@ from oasis_warp.avatar.quality import (
 )
 from oasis_warp.avatar.wrist import ARM_STEP, close_wrist, end_shade
 from oasis_warp.core import surface
-from oasis_warp.core.config import ReconstructConfig, adapt_config, check_config
+from oasis_warp.core.config import ReconstructConfig, adapt_config
+from oasis_warp.core.devices import check_run
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.hand_model import HandModel
 from oasis_warp.core.logging import Progress, silent, timed_stage
 from oasis_warp.core.mirror import mirror_pose
 from oasis_warp.core.processes import single_threaded_math
 from oasis_warp.core.types import CanonicalGaussians, HandCrop, HandFit, HandLight, Landmarks, Photo, Render
-from oasis_warp.data.photo import read_photo
+from oasis_warp.data.photo import as_photo
 from oasis_warp.estimation.estimator import HandEstimator, check_sides, choose_hand, fit_together
 from oasis_warp.estimation.fit_quality import keeps_quality, with_pose
 from oasis_warp.estimation.hand_crop import (
@@ -161,11 +162,10 @@ def reconstruct(
 
     Raises:
         InputError: no such hand in the photo, a fit too poor to go on (see `ReconstructConfig.force`), a wrong file.
+        TypeError: no photo.
     """
-    check_config(config)  # before a file is read
-    if isinstance(photo, str | Path):
-        photo = read_photo(photo)
-    fused, (of_photo,), of_coverage = _run([photo], config, keypoints, prior, perceptual, progress)
+    check_run(config)  # before a file is read
+    fused, (of_photo,), of_coverage = _run([as_photo(photo)], config, keypoints, prior, perceptual, progress)
     (own,) = fused.photos
     errors = {name: value for name, value in own.errors.items() if name != "best_percent"} | fused.errors
     warnings = (*own.fit.warnings, *of_coverage, *of_photo)
@@ -194,15 +194,17 @@ def reconstruct_same_hand(
         progress: Called as work goes on.
 
     Raises:
+        TypeError: one alone, or one that is none.
         ValueError: no photo.
         InputError: a photo without such a hand, with a hand of the other side, or with a fit too poor to go on (see
             `ReconstructConfig.force`); the message names it. Or a wrong file.
     """
-    if not photos:
+    if isinstance(photos, Photo | Path | str):
+        raise TypeError(f"photos: expected a list, got one {type(photos).__name__}; put it in brackets, [photo].")
+    if not (photos := list(photos)):
         raise ValueError("photos: expected at least one, got none. Read them with oasis_warp.read_photo.")
-    check_config(config)
-    photos = [read_photo(photo) if isinstance(photo, str | Path) else photo for photo in photos]
-    fused, of_photos, of_coverage = _run(photos, config, None, prior, perceptual, progress)
+    check_run(config)
+    fused, of_photos, of_coverage = _run([*map(as_photo, photos)], config, None, prior, perceptual, progress)
     return fused._replace(warnings=(*_name_warnings(fused.photos, of_photos), *of_coverage))
 
 

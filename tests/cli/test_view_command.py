@@ -248,6 +248,33 @@ def test_a_refused_photo_gets_the_program_s_sentence_and_the_next_one_its_turn(f
     wait(form_server, good, "done")
 
 
+def no_room(path, data):
+    raise InputError(f"{path}: no room left to write it; free some.")
+
+
+@pytest.mark.parametrize(
+    ("broken", "in_its_place", "said"),
+    [
+        ("write_file", no_room, "the photo: found no hand; give another photo."),
+        ("PROGRAM", ("/no/such/program",), "The program failed: [Errno 2] No such file or directory"),
+    ],
+)
+def test_whatever_fails_a_photo_ends_as_failed_and_the_next_ones_get_their_turn(
+    program, tmp_path, monkeypatch, broken, in_its_place, said
+):
+    jobs = Jobs(tmp_path / "served")
+    waiting = [jobs.add("a.jpg", b"bad") for _ in range(2)]
+    worker = threading.Thread(target=jobs.work, daemon=True)
+    with monkeypatch.context() as patch:
+        patch.setattr(jobs_module, broken, in_its_place)
+        worker.start()
+        for job in waiting:
+            assert until(jobs, job, "failed").note.startswith(said)
+    until(jobs, jobs.add("a.jpg", b"good"), "done")
+    jobs.stop()
+    worker.join()
+
+
 def test_strangers_and_other_sites_get_nothing(form_server):
     assert ask_form(form_server, "")[0] == 200
     assert ask_form(form_server, "", token="x" * len(form_server.token))[0] == 404
@@ -277,6 +304,14 @@ def look(jobs, job):
     found = jobs.look(job)
     assert found is not None
     return found
+
+
+def until(jobs, job, state):
+    for _ in range(400):
+        if (found := look(jobs, job)).state == state:
+            return found
+        time.sleep(0.02)
+    raise AssertionError(found)
 
 
 def test_a_browser_that_goes_away_leaves_no_traceback(form_server, capsys):
@@ -316,11 +351,9 @@ def test_a_photo_that_takes_too_long_is_ended(program, tmp_path, monkeypatch):
     job = jobs.add("a.jpg", b"slow")
     worker = threading.Thread(target=jobs.work)
     worker.start()
-    while look(jobs, job).state != "failed":
-        time.sleep(0.02)
+    assert until(jobs, job, "failed").note.startswith("It took longer than")
     jobs.stop()
     worker.join()
-    assert look(jobs, job).note.startswith("It took longer than")
 
 
 def test_the_command_serves_until_ctrl_c_and_refuses_a_file_for_a_folder(tmp_path, monkeypatch, capsys):

@@ -53,6 +53,16 @@ def test_a_wrong_pose_is_refused_in_every_format(right_hand, ending, tmp_path, a
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_pose_has_a_name_as_everywhere_and_what_is_none_is_refused(right_hand, tmp_path, as_shipped):
+    for name, pose in (("a.json", "fist"), ("b.json", right_hand.held("fist"))):
+        export_avatar(right_hand, tmp_path / name, pose=pose)
+    assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
+    with pytest.raises(TypeError, match="pose: expected a HandPose or a pose's name, got int"):
+        export_avatar(right_hand, tmp_path / "c.json", pose=3)
+    with pytest.raises(TypeError, match="photo: expected a Photo or its file, got int"):
+        export_avatar(right_hand, tmp_path / "c.html", photo=3)
+
+
 @pytest.mark.parametrize("ending", [".glb", ".spz", ".obj", ".json"])
 def test_avatars_on_a_device_or_with_gradients_are_the_same_files(left_hand, ending, device, tmp_path):
     left_hand.save(tmp_path / "avatar.safetensors")

@@ -130,6 +130,10 @@ def _noise(photo: np.ndarray, apart: np.ndarray) -> np.ndarray:
     return quiet[bins]
 
 
+class NoPaintError(ValueError):
+    """There is no paint on the surface."""
+
+
 class RepaintResult(NamedTuple):
     """Gaussians with the paint."""
 
@@ -172,7 +176,7 @@ def repaint(
         progress: Called as work goes on.
 
     Raises:
-        ValueError: no paint on the surface.
+        NoPaintError: no paint on the surface.
     """
     seen = map_surface(posed, faces, canvas, FACING)
     around = _faces_around_paint(seen, faces, len(rest))
@@ -207,12 +211,12 @@ def _faces_around_paint(seen: SurfaceMap, faces: Int[Tensor, "F 3"], n_vertices:
     """Faces under the paint, and `RINGS` of neighbours.
 
     Raises:
-        ValueError: there is no paint.
+        NoPaintError: there is no paint.
     """
     chosen = torch.zeros(len(faces), dtype=torch.bool, device=faces.device)
     chosen[seen.faces[seen.share > MIN_PAINT]] = True
     if not bool(chosen.any()):
-        raise ValueError("canvas: expected paint on the hand, got none. Check its mask and its camera.")
+        raise NoPaintError("canvas: expected paint on the hand, got none. Check its mask and its camera.")
     for _ in range(RINGS):
         chosen = with_neighbours(chosen, faces, n_vertices)
     return chosen

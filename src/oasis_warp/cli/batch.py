@@ -21,9 +21,10 @@ from oasis_warp.cli.batch_work import AVATARS, MAX_TRIES, ROWS, TRIES, Order, ma
 from oasis_warp.cli.jobs import SUFFIXES
 from oasis_warp.cli.loopback import LOOPBACK
 from oasis_warp.cli.options import Batch
-from oasis_warp.cli.progress import BAD_INPUT, INTERRUPTED, ManyPhotos, Terminal, check_device, plain_console, show_run
+from oasis_warp.cli.progress import BAD_INPUT, INTERRUPTED, ManyPhotos, Terminal, plain_console, show_run
 from oasis_warp.cli.record import exact_command
 from oasis_warp.core.config import ReconstructConfig, check_config
+from oasis_warp.core.devices import check_device
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
 from oasis_warp.data.output_files import make_folders, output_file, remove_leftovers, write_file
@@ -62,7 +63,7 @@ def open_cluster(workers: int | None, scheduler: str | None, device: str) -> Ite
         raise InputError("oasis batch: needs Dask distributed; install it: pip install 'oasis-warp[batch]'.") from error
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters of it is raised
     if scheduler is None:
-        check_device(device)
+        check_device(device, "--")
         warm_up(device)  # kernels are compiled once, and not by all workers at the same time
         n = workers or len(os.sched_getaffinity(0))
         with _local(distributed, n) as client:

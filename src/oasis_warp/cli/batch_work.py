@@ -25,9 +25,9 @@ import torch
 
 from oasis_warp import __version__
 from oasis_warp.avatar.prior import Prior
-from oasis_warp.cli.progress import check_device
 from oasis_warp.cli.reconstruct import write_results
 from oasis_warp.core.config import ReconstructConfig
+from oasis_warp.core.devices import check_device
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import timed_stage
 from oasis_warp.core.types import Photo
@@ -125,7 +125,7 @@ def prepare(order: Order) -> None:
         raise InputError(
             f"a worker has oasis_warp {__version__}, the run was started by {order.version}; install the same version."
         )
-    check_device(order.config.device)
+    check_device(order.config.device, "--")
     check_opencv()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)

@@ -23,8 +23,9 @@ from oasis_warp.bench.tables import (
     speed_table,
 )
 from oasis_warp.cli.developer_options import Bench, ErrorTime, Kernels, Roofline, Scaling
-from oasis_warp.cli.progress import Terminal, check_device, print_tables, show_progress
+from oasis_warp.cli.progress import Terminal, print_tables, show_progress
 from oasis_warp.cli.record import exact_command
+from oasis_warp.core.devices import check_device
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.processes import using_threads
 from oasis_warp.data.output_files import output_file, output_folder
@@ -42,7 +43,7 @@ def run(options: Bench) -> int:
         InputError: a wrong option or output.
     """
     chosen = options.what
-    check_device(chosen.device)
+    check_device(chosen.device, "--")
     match chosen:
         case ErrorTime():
             run_error_time(chosen)

@@ -9,17 +9,17 @@ from rich.console import Console
 
 from oasis_warp import __version__
 from oasis_warp.cli.options import Edit as Options
-from oasis_warp.cli.progress import EDIT_PLAN, Run, Terminal, check_device, plain_console, show_run
+from oasis_warp.cli.progress import EDIT_PLAN, Run, Terminal, plain_console, show_run
 from oasis_warp.cli.record import exact_command, written
 from oasis_warp.cli.report import measures_table, print_warnings, to_json
 from oasis_warp.cli.summary import GROUND, WIDTH, Panel, make_sheet, panel_side
 from oasis_warp.core.camera import crop_camera
 from oasis_warp.core.config import EditConfig, check_config
+from oasis_warp.core.devices import check_device
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import timed_stage
 from oasis_warp.core.types import Camera, HandPose
 from oasis_warp.data.output_files import output_folder, write_file
-from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import to_uint8, write_picture
 from oasis_warp.data.square_crop import resample_square
 from oasis_warp.editing import Edit, edit
@@ -45,7 +45,7 @@ def run(options: Options) -> int:
     Raises:
         InputError: a wrong file or option, an output that exists, or no paint on the hand.
     """
-    check_device(options.device)
+    check_device(options.device, "--")
     config = EditConfig(steps=options.steps, size=options.size)
     check_config(config, "--")
     out = options.out or options.avatar.with_name(f"{options.avatar.stem}-{options.painted.stem}.safetensors")
@@ -56,9 +56,9 @@ def run(options: Options) -> int:
         before = Avatar.load(options.avatar, options.device)
         made = edit(
             before,
-            read_photo(options.painted),
-            photo=read_photo(options.photo) if options.photo else None,
-            mask=read_photo(options.mask) if options.mask else None,
+            options.painted,
+            photo=options.photo,
+            mask=options.mask,
             config=config,
             progress=shown.progress,
         )

@@ -8,9 +8,10 @@ from rich.table import Table
 
 from oasis_warp.avatar.prior import MeanPrior, Prior
 from oasis_warp.cli.developer_options import Evaluate
-from oasis_warp.cli.progress import INTERRUPTED, Run, Step, Terminal, check_device, print_tables, show_run
+from oasis_warp.cli.progress import INTERRUPTED, Run, Step, Terminal, print_tables, show_run
 from oasis_warp.cli.record import keep_command
 from oasis_warp.core.config import ReconstructConfig, adapt_config
+from oasis_warp.core.devices import check_device
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
 from oasis_warp.evaluation.band_energy import SIZE
@@ -69,7 +70,7 @@ def run(options: Evaluate) -> int:
     Raises:
         InputError: a wrong option, folder or weights file.
     """
-    check_device(options.device)
+    check_device(options.device, "--")
     check_options(options)
     priors: dict[str, Prior] = {"mean": MeanPrior(bundled_hand())}
     chosen = choose_prior(options.prior, options.backbone_weights)

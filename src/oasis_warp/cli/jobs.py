@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from oasis_warp.core.errors import InputError, last_line
+from oasis_warp.core.logging import logger
 from oasis_warp.data.output_files import write_file
 
 MAX_WAITING = 16
@@ -57,6 +58,8 @@ class Jobs:
         self._exporting = threading.Lock()
         left = [path for path in folder.iterdir() if ID.fullmatch(path.name) and self._on_disk(path) is None]
         self._waiting = deque(path.name for path in sorted(left, key=lambda path: path.stat().st_mtime))
+        self._failed: dict[str, str] = {}
+        """Sentences that could not be written to error.txt; a restart tries these photos again."""
         self._running: tuple[str, str] | None = None
         self._process: subprocess.Popen[str] | None = None
         self._stopped = False
@@ -96,6 +99,8 @@ class Jobs:
                 return Job("running", self._running[1], 0)
             if job in self._waiting:
                 return Job("waiting", "", self._waiting.index(job) + (self._running is not None))
+            if job in self._failed:
+                return Job("failed", self._failed[job], 0)
         return self._on_disk(self.folder / job) if ID.fullmatch(job) else None
 
     def file(self, job: str, name: str) -> Path | None:
@@ -124,7 +129,7 @@ class Jobs:
         return path
 
     def work(self) -> None:
-        """Reconstruct what waits, until `stop`."""
+        """Reconstruct what waits, until `stop`; whatever goes wrong, each photo ends as done or failed."""
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting or self._stopped)
@@ -132,9 +137,21 @@ class Jobs:
                     return
                 job = self._waiting.popleft()
                 self._running = job, "starting"
-            self._reconstruct(self.folder / job)
+            try:
+                why = self._reconstruct(self.folder / job)
+            except Exception as error:  # the photos that wait need this thread
+                why = f"The program failed: {last_line(str(error), SILENT, 500)}"
+            if why is not None and not self._stopped:
+                self._fail(job, why)
             with self._changed:
                 self._running = self._process = None
+
+    def _fail(self, job: str, why: str) -> None:
+        try:
+            write_file(self.folder / job / "error.txt", why.encode())
+        except InputError as error:
+            logger.warning("%s", error)
+            self._failed[job] = why
 
     def stop(self) -> None:
         """End the work; the photo in progress waits again for the next start."""
@@ -144,11 +161,11 @@ class Jobs:
                 self._process.kill()
             self._changed.notify()
 
-    def _reconstruct(self, home: Path) -> None:
+    def _reconstruct(self, home: Path) -> str | None:
+        """Why there is no avatar of the photo; None where there is one."""
         photo = next(home.glob("photo.*"), None)
         if photo is None:  # the server was stopped before the photo was whole
-            write_file(home / "error.txt", b"The photo did not arrive completely; send it again.")
-            return
+            return "The photo did not arrive completely; send it again."
         command = [*PROGRAM, "reconstruct", str(photo), "-o", str(home / "out")]
         with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
             with self._changed:
@@ -162,12 +179,10 @@ class Jobs:
             for line in process.stderr:
                 with self._changed:
                     self._running = home.name, line.partition(":")[0].strip()[:60]
-            code = process.wait()
+            process.wait()
             limit.cancel()
-        if code == 0 or self._stopped:
-            return
+        if self._on_disk(home) is not None:
+            return None
         late = time.monotonic() - started >= MAX_SECONDS
         message = f"It took longer than {MAX_SECONDS // 60} minutes." if late else last_line(line, SILENT, 500)
-        write_file(
-            home / "error.txt", message.replace(str(photo), "the photo").replace(photo.name, "the photo").encode()
-        )
+        return message.replace(str(photo), "the photo").replace(photo.name, "the photo")

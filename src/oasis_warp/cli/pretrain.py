@@ -13,8 +13,9 @@ from typing import Any
 import torch
 
 from oasis_warp.cli.developer_options import Pretrain
-from oasis_warp.cli.progress import INTERRUPTED, Terminal, check_device, show_progress
+from oasis_warp.cli.progress import INTERRUPTED, Terminal, show_progress
 from oasis_warp.cli.record import keep_command
+from oasis_warp.core.devices import check_device
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
 from oasis_warp.core.published_files import published_file
@@ -56,7 +57,7 @@ def run(options: Pretrain) -> int:
     Raises:
         InputError: a wrong option or folder, weights that do not fit, or a loss that is not finite.
     """
-    check_device(options.device)
+    check_device(options.device, "--")
     check_options(options)
     with join_processes(options.device) as process:
         shown = show_progress(Terminal()) if process.rank == 0 else nullcontext(silent)

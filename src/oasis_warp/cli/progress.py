@@ -14,7 +14,6 @@ from rich.table import Table
 
 from oasis_warp.cli.record import is_quiet
 from oasis_warp.core.config import ReconstructConfig, adapt_config
-from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
 
 FAULT = 1
@@ -348,15 +347,3 @@ def print_tables(tables: Iterable[Table], width: int) -> None:
         console.width = width
     for table in tables:
         console.print(table)
-
-
-def check_device(device: str) -> None:
-    """Check that torch can compute on `device`.
-
-    Raises:
-        InputError: there is no CUDA device.
-    """
-    import torch  # takes seconds, which `oasis --help` saves
-
-    if device == "cuda" and not torch.cuda.is_available():
-        raise InputError("--device cuda: torch finds no CUDA device; use --device cpu, or see `oasis doctor`.")

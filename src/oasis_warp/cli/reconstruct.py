@@ -2,7 +2,6 @@
 
 import os
 import sys
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import fields
@@ -16,7 +15,6 @@ from oasis_warp.cli.progress import (
     INTERRUPTED,
     Run,
     Terminal,
-    check_device,
     plain_console,
     reconstruct_plan,
     show_run,
@@ -25,11 +23,12 @@ from oasis_warp.cli.record import written
 from oasis_warp.cli.report import make_report, print_report, to_json
 from oasis_warp.cli.summary import GROUND, draw_quality, draw_summary
 from oasis_warp.core.config import ReconstructConfig, check_config
+from oasis_warp.core.devices import check_device
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent, timed_stage
 from oasis_warp.core.processes import single_threaded_math
 from oasis_warp.core.types import Photo
-from oasis_warp.data.output_files import make_folders, output_folder
+from oasis_warp.data.output_files import check_apart, make_folders, output_folder
 from oasis_warp.data.photo import read_photo
 from oasis_warp.data.pictures import write_picture, write_video
 from oasis_warp.estimation.estimator import HandEstimator, choose_hand, palm_and_back
@@ -47,7 +46,7 @@ def run(options: Reconstruct) -> int:
     Raises:
         InputError: an option is wrong, or the one photo cannot be turned into an avatar.
     """
-    check_device(options.device)
+    check_device(options.device, "--")
     _check_photos(options)
     config = ReconstructConfig(**{field.name: getattr(options, field.name) for field in fields(ReconstructConfig)})
     check_config(config, "--")
@@ -67,11 +66,9 @@ def _check_photos(options: Reconstruct) -> None:
         raise InputError("photos: expected at least one, got none; name them after `oasis reconstruct`.")
     if len(options.photos) > 1 and options.keypoints is not None:
         raise InputError("--keypoints: works with one photo, but several were given; run them one by one.")
-    if options.same_hand:
-        return
-    counts = Counter(photo.stem for photo in options.photos)
-    if twins := [str(photo) for photo in options.photos if counts[photo.stem] > 1]:
-        raise InputError(f"photos: {' and '.join(twins)} would share one output folder; run them one by one.")
+    if not options.same_hand:
+        names = [photo.stem for photo in options.photos]
+        check_apart(options.photos, names, "output folder", "run them one by one")
 
 
 def _is_one_hand(options: Reconstruct) -> bool:

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from oasis_warp.avatar.sky import environment_light, studio_light
 from oasis_warp.cli.options import Animate, Render
-from oasis_warp.cli.progress import check_device
 from oasis_warp.cli.record import written
 from oasis_warp.core.config import BLACK, WHITE
+from oasis_warp.core.devices import check_device
 from oasis_warp.core.errors import InputError, did_you_mean
 from oasis_warp.core.processes import single_threaded_math
 from oasis_warp.core.types import HandPose
@@ -33,7 +33,7 @@ def check_numbers(options: Render | Animate) -> None:
     Raises:
         InputError: no such device, a picture too small or too large, or an angle that is no number.
     """
-    check_device(options.device)
+    check_device(options.device, "--")
     if not 16 <= options.size <= MAX_SIDE:
         raise InputError(f"--size {options.size}: expected 16 to {MAX_SIDE} pixels; choose another size.")
     for name in ("azimuth", "elevation"):

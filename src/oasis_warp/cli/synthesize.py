@@ -5,7 +5,8 @@ import sys
 import torch
 
 from oasis_warp.cli.developer_options import Synthesize
-from oasis_warp.cli.progress import INTERRUPTED, Terminal, check_device, show_progress
+from oasis_warp.cli.progress import INTERRUPTED, Terminal, show_progress
+from oasis_warp.core.devices import check_device
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress
 from oasis_warp.data.pictures import PICTURE_SUFFIXES, check_suffix, contact_sheet, to_uint8, write_picture
@@ -25,7 +26,7 @@ def run(options: Synthesize) -> int:
     Raises:
         InputError: a wrong option, folder or output.
     """
-    check_device(options.device)
+    check_device(options.device, "--")
     if options.count < 1:
         raise InputError(f"--count: expected 1 or more, got {options.count}; say how many pictures to make.")
     if options.size not in SIZES:

@@ -4,6 +4,7 @@ The command line imports this module, so that it must stay free of torch: `oasis
 """
 
 from dataclasses import dataclass, replace
+from numbers import Integral
 from pathlib import Path
 from typing import Literal, get_args, get_origin, get_type_hints
 
@@ -117,24 +118,27 @@ def check_config(config: AdaptConfig | ReconstructConfig | EditConfig, flag: str
     """Check the options of a run before any work; `flag` stands before names in messages: "--" on the command line.
 
     Raises:
-        InputError: a choice that there is not, a size out of range, or a negative number of steps or of the hand.
+        InputError: a choice that there is not, no integer where one is expected, a size out of range, or a negative
+            number of steps or of the hand.
     """
     for name, hint in get_type_hints(type(config)).items():
-        value = getattr(config, name)
-        choices = [c for part in (hint, *get_args(hint)) if get_origin(part) is Literal for c in get_args(part)]
-        if isinstance(value, str) and choices and Path not in get_args(hint) and value not in choices:
-            listed = ", ".join(map(str, choices))
-            raise InputError(f"{flag}{name} {value}: expected one of {listed}; choose one of them.")
-    size: int | str = getattr(config, "size", "auto")
+        value, kinds = getattr(config, name), (hint, *get_args(hint))
+        choices = [c for kind in kinds if get_origin(kind) is Literal for c in get_args(kind)]
+        wanted = ["an integer"] * (int in kinds) + [repr(choice) for choice in choices]
+        integer = int in kinds and isinstance(value, Integral)
+        known = integer or value in choices or (value is None and type(None) in kinds)
+        if wanted and not known and Path not in kinds:
+            raise InputError(f"{flag}{name} {value!r}: expected {' or '.join(wanted)}; choose another value.")
+    size = getattr(config, "size", "auto")
     low, high = PAINT_SIDES if isinstance(config, EditConfig) else CROP_SIDES
-    if isinstance(size, int) and not low <= size <= high:
+    if isinstance(size, Integral) and not low <= int(size) <= high:
         raise InputError(f"{flag}size {size}: expected {low} to {high} pixels; choose another size.")
     for name, hint in (
         ("steps", "leave it out for the default"), ("texture_steps", "leave it out for the default"),
         ("calibration_steps", "0 uses the closed form"), ("hand", "0 is the best detection"),
     ):  # fmt: skip
         value = getattr(config, name, None)
-        if isinstance(value, int) and value < 0:
+        if isinstance(value, Integral) and value < 0:
             raise InputError(f"{flag}{name} {value}: expected 0 or more; {hint}.")
 
 

@@ -13,7 +13,8 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -271,6 +272,23 @@ def _explain(path: Path | str, error: OSError) -> InputError:
     if error.errno == errno.ENAMETOOLONG:
         return InputError(f"{path}: the name is too long for this disk; choose a shorter one.")
     return InputError(f"{path}: cannot be written ({error.strerror}); check the permissions of its folder.")
+
+
+def check_apart(inputs: Sequence[Path], names: Sequence[str], shared: str, remedy: str) -> None:
+    """Check that what is written of each photo has a name of its own.
+
+    Args:
+        inputs: The photos.
+        names: Of their outputs.
+        shared: What two of one name would share, for messages.
+        remedy: What to do about it.
+
+    Raises:
+        InputError: two photos or more have one name.
+    """
+    counts = Counter(names)
+    if twins := [str(path) for path, name in zip(inputs, names, strict=True) if counts[name] > 1]:
+        raise InputError(f"photos: {' and '.join(twins)} would share one {shared}; {remedy}.")
 
 
 def open_resumable_folder(folder: Path, name: str, settings: dict[str, Any], content: str) -> None:

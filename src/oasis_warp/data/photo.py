@@ -103,6 +103,22 @@ def read_photo(path: Path | str, *, max_pixels: int = MAX_PIXELS, content: bytes
     )
 
 
+def as_photo(given: Photo | Path | str, name: str = "photo") -> Photo:
+    """The photo itself, or that of a file; `name` is the argument's, for messages.
+
+    Raises:
+        InputError: see `read_photo`.
+        TypeError: it is neither.
+    """
+    if isinstance(given, Path | str):
+        return read_photo(given)
+    if not isinstance(given, Photo):
+        raise TypeError(
+            f"{name}: expected a Photo or its file, got {type(given).__name__}; save the picture and give its file."
+        )
+    return given
+
+
 def read_bytes(path: Path, content: str = "a photo") -> bytes:
     """The bytes of a file of bounded size.
 

@@ -4,6 +4,7 @@ A data set has many pictures of few people, each with the hand that its annotati
 become avatars, evenly spaced over all, and for each of them others are compared with, evenly spaced too.
 """
 
+import hashlib
 import json
 import math
 import os
@@ -63,8 +64,9 @@ class Key(NamedTuple):
 
     @property
     def file(self) -> str:
-        """What its files are called."""
-        return re.sub(r"[^\w.-]+", "-", self.name)
+        """What its files are called: as the picture, or with a digest of its name where that is no name of a file."""
+        plain = re.sub(r"[^\w.-]+", "-", self.name)
+        return plain if plain == self.name else f"{plain}-{hashlib.sha256(self.name.encode()).hexdigest()[:8]}"
 
 
 class Sample(NamedTuple):
@@ -164,6 +166,7 @@ def evaluate_data_set(
     Raises:
         InputError: a folder that cannot be used, or no picture that an avatar could be made of.
     """
+    config = ReconstructConfig(hand_model=config.hand_model, mano_dir=config.mano_dir, device=config.device)
     settings = {
         "version": __version__, "priors": {name: prior_digest(prior) for name, prior in priors.items()},
         "lpips": perceptual is not None, "hand_model": config.hand_model, **asdict(choice),

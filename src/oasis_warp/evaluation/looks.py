@@ -13,7 +13,7 @@ from oasis_warp.avatar.prior import Prior
 from oasis_warp.core.config import ReconstructConfig
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.logging import Progress, silent
-from oasis_warp.data.output_files import open_resumable_folder, write_file
+from oasis_warp.data.output_files import check_apart, open_resumable_folder, write_file
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator
 from oasis_warp.evaluation.band_energy import BANDS
@@ -76,13 +76,13 @@ def evaluate_looks(
     Raises:
         InputError: a folder that cannot be used, or no photo of which an avatar can be made.
     """
-    if not folder.is_dir() or not (photos := photos_in(folder)):
-        raise InputError(f"{folder}: expected a folder with photos of hands, found none there.")
-    groups = real_photos(folder)
+    photos, groups = find_photos(folder)
+    noted = {"steps": config.steps, "seed": config.seed}
+    config = ReconstructConfig(**noted, device=config.device)
     settings = {
         "version": __version__, "prior": {"name": prior.about["name"], "weights": prior_digest(prior)},
         "photos": [path.name for path in photos], "real": [path.name for path in groups],
-        "lpips": perceptual is not None, **{name: getattr(config, name) for name in ("steps", "seed")},
+        "lpips": perceptual is not None, **noted,
     }  # fmt: skip
     open_resumable_folder(out, SETTINGS, settings, "an evaluation")
     for inner in (AVATARS, REAL, SHEETS):
@@ -113,11 +113,31 @@ def evaluate_looks(
     return whole
 
 
+def find_photos(folder: Path) -> tuple[list[Path], dict[Path, str]]:
+    """The photos of which avatars are made, and those of real hands with the hand that each one shows.
+
+    Raises:
+        InputError: there is none, or the records of two would have one name.
+    """
+    if not folder.is_dir() or not (photos := photos_in(folder)):
+        raise InputError(f"{folder}: expected a folder with photos of hands, found none there.")
+    groups = real_photos(folder)
+    names = [real_name(path, hand) for path, hand in groups.items()]
+    check_apart(photos, [path.stem for path in photos], "record", "rename one of them")
+    check_apart(list(groups), names, "record", "rename one of them")
+    return photos, groups
+
+
 def hand_of(path: Path, groups: Mapping[Path, str]) -> str:
     """The hand that a photo shows, by `real_photos`, which may hold it in a subfolder."""
     data = path.read_bytes()
     same = (name for other, name in groups.items() if other == path or other.read_bytes() == data)
     return next(same, path.stem)
+
+
+def real_name(path: Path, hand: str) -> str:
+    """Name of the record of a real photo."""
+    return f"{hand}_{path.stem}"
 
 
 def measure_all_real(
@@ -128,7 +148,7 @@ def measure_all_real(
     for k, (path, hand) in enumerate(groups.items()):
         progress("real hands", k, len(groups))
         name = f"{hand}/{path.name}"
-        file = folder / f"{hand}_{path.stem}.json"
+        file = folder / f"{real_name(path, hand)}.json"
         record = read_result(file, ("hand", "mostly", "features"))
         if record is None:
             try:

@@ -261,11 +261,13 @@ def evaluate_photos(
     """
     hands = photos_of_hands(folder)
     methods = [method for method in PHOTO_METHODS if method.prior in priors]
+    noted = {"steps": config.steps, "seed": config.seed, "size": config.size}
+    config = ReconstructConfig(**noted, device=config.device)
     settings = {
         "version": __version__,
         "priors": {name: prior_digest(prior) for name, prior in priors.items()},
         "photos": {name: [path.name for path in paths] for name, paths in hands.items()},
-        **{name: getattr(config, name) for name in ("steps", "seed", "size")},
+        **noted,
     }
     open_resumable_folder(out, SETTINGS, settings, "an evaluation")
     (out / HANDS).mkdir(exist_ok=True)

@@ -7,6 +7,7 @@ import torch
 
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import HandPose, Photo
+from oasis_warp.data.photo import as_photo
 from oasis_warp.export import usd
 from oasis_warp.export.hand_parameters import write_parameters
 from oasis_warp.export.page_file import write_page
@@ -23,7 +24,7 @@ from oasis_warp.export.splat_formats import (
 )
 from oasis_warp.export.surface_mesh import write_obj
 from oasis_warp.export.usd import write_skinned_usd, write_splat_usd
-from oasis_warp.hand_avatar import Avatar
+from oasis_warp.hand_avatar import Avatar, check_pose_type
 from oasis_warp.ops import check_finite
 from oasis_warp.ops.checks import check_choice, check_shape
 
@@ -68,31 +69,37 @@ def export_avatar(
     avatar: Avatar,
     path: Path | str,
     *,
-    pose: HandPose | None = None,
+    pose: HandPose | str | None = None,
     light: Light | None = None,
-    photo: Photo | None = None,
+    photo: Photo | Path | str | None = None,
 ) -> None:
     """Write `avatar` in the format that the ending of `path` says; docs/export.md lists them.
 
     Args:
         avatar: The avatar whose Gaussians or skin are written.
         path: File to write; an existing one is replaced when the new one is complete.
-        pose: Pose of the hand. By default that of the photo, and in files that can be posed the rest pose.
+        pose: Pose of the hand, or the name of one, as in `Avatar.held`. By default that of the photo, and in files that
+            can be posed the rest pose.
         light: "baked" to write colours as they are in the avatar's light, "none" as in even light, for programs with
             lights of their own. By default "baked" for Gaussians, and "none" for meshes.
-        photo: Shown beside the hand in a .html page; other formats have no place for it.
+        photo: Shown beside the hand in a .html page, or its file; other formats have no place for it.
 
     Raises:
         InputError: an unknown ending, a value that is not finite, or `path` cannot be written.
-        ValueError: a part of the pose has another shape or is not finite, or another light.
+        TypeError: `pose` is neither a pose nor a name, or `photo` neither a photo nor a file.
+        ValueError: a part of the pose has another shape or is not finite, no pose has that name, or another light.
     """
     writer = choose_writer(path)
     if light is not None:
         check_choice("light", light, ("baked", "none"))
+    if isinstance(pose, str):
+        pose = avatar.held(pose)
     if pose is not None:
+        check_pose_type(pose)
         check_shape("pose.angles", pose.angles, 15, 3, hint="One pose a file.")
         check_shape("pose.orientation", pose.orientation, 3, 3)
         check_shape("pose.translation", pose.translation, 3)
         check_finite(**pose._asdict())
         pose = HandPose(*(part.detach().to(avatar.shape).cpu() for part in pose))
-    writer(ExportRequest(avatar.to("cpu"), pose, light, photo), Path(path))
+    shown = None if photo is None else as_photo(photo)
+    writer(ExportRequest(avatar.to("cpu"), pose, light, shown), Path(path))

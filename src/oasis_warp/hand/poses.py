@@ -68,6 +68,7 @@ _FINGERS: dict[str, dict[str, Finger]] = {
 }  # fmt: skip
 
 POSE_NAMES = ("rest", *_FINGERS)
+"""Names of poses."""
 
 NEAR = 0.004
 """Distance up to which vertices of the mean hand count as touching, if their normals are `OPPOSED` [m]."""

@@ -1,6 +1,8 @@
 """Differentiable operators on torch tensors, computed by Warp kernels on the CPU or a CUDA device."""
 
 from oasis_warp.ops._runtime.declaration import DECLARATIONS as DECLARATIONS
+from oasis_warp.ops._runtime.pair_counts import Overflow as Overflow
+from oasis_warp.ops._runtime.pair_counts import watch_overflow as watch_overflow
 from oasis_warp.ops._runtime.values import DeferredFiniteCheck as DeferredFiniteCheck
 from oasis_warp.ops._runtime.values import check_finite as check_finite
 from oasis_warp.ops._runtime.warm_up import warm_up as warm_up
