@@ -138,7 +138,7 @@ def test_attributes_from_which_all_else_is_computed_cannot_be_set(left):
 
 
 def test_an_avatar_says_what_it_is(left):
-    assert repr(left) == f"Avatar(left, {len(left.gaussians.colors)} Gaussians, without light, on cpu)"
+    assert repr(left) == f"Avatar(left hand, {len(left.gaussians.colors)} Gaussians, on cpu)"
 
 
 def test_an_avatar_moves_without_gradients_and_stays_itself_where_nothing_changes(left):

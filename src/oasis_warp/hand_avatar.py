@@ -125,8 +125,8 @@ class Avatar:
             camera = mirror_camera(source_camera) if left else source_camera
             center = camera_center(camera.viewmat.to(vertices))
             photo = self._photo_surface()
-            known = with_photo(light, self.rest.vertices, photo, self.hand.faces, center)
-            known = known._replace(corners=gaussian_corners(self.hand.faces, gaussians))
+            corners = gaussian_corners(self.hand.faces, gaussians)
+            known = with_photo(light, self.rest.vertices, photo, self.hand.faces, center)._replace(corners=corners)
             self._light = mirror_surface_light(known) if left else known
             self._folds = find_folds(self.hand, gaussians, invented, source_pose.angles.to(vertices))
             self._creases = find_creases(self.hand, gaussians, invented, photo, self._folds)
@@ -142,8 +142,7 @@ class Avatar:
         super().__setattr__(name, value)
 
     def __repr__(self) -> str:
-        light = "without" if self.light is None else "with"
-        return f"Avatar({self.side}, {len(self.gaussians.colors)} Gaussians, {light} light, on {self.device})"
+        return f"Avatar({self.side} hand, {len(self.gaussians.colors)} Gaussians, on {self.device})"
 
     def _photo_surface(self) -> Float[Tensor, "V 3"]:
         """Vertices in the photo's pose; of a left hand in the mirror, where faces wind outwards."""
@@ -254,9 +253,7 @@ class Avatar:
     def orbit_camera(self, pose: HandPose | str, azimuth: float, elevation: float = 0.0, size: int = 256) -> Camera:
         """A camera that frames the hand in one `pose`, as `core.camera.orbit_camera` does; it moves around the arm.
 
-        Raises:
-            TypeError: `pose` is neither a pose nor a name.
-            ValueError: a part of the pose has another shape or is not finite, or no pose has that name.
+        Raises as `mesh`.
         """
         pose = self._checked(pose, validate=True)
         check_shape("pose.angles", pose.angles, 15, 3, hint="One pose a camera.")
