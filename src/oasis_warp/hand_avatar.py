@@ -176,7 +176,8 @@ class Avatar:
             self._held[name] = named_pose(self.hand, name, self.rest)
         return self.source_pose._replace(angles=self._held[name].to(self.source_pose.angles))
 
-    def _as_pose(self, pose: HandPose | str) -> HandPose:
+    def as_pose(self, pose: HandPose | str) -> HandPose:
+        """A pose itself, or the one of that name, as `held`; a TypeError if it is neither."""
         if isinstance(pose, str):
             return self.held(pose)
         if not isinstance(pose, HandPose):
@@ -185,7 +186,7 @@ class Avatar:
 
     def _checked(self, pose: HandPose | str, validate: bool) -> HandPose:
         """The pose in the avatar's precision and place."""
-        pose = self._as_pose(pose)
+        pose = self.as_pose(pose)
         batch, sizes = ("B",) if pose.angles.ndim == 3 else (), {}
         hint = "One row for each joint but the wrist."
         check_shape("pose.angles", pose.angles, *batch, 15, 3, sizes=sizes, hint=hint)
@@ -290,7 +291,7 @@ class Avatar:
             TypeError: `pose` is neither a pose nor a name.
             ValueError: a part of the pose or the camera has another shape or is not finite, or no pose has that name.
         """
-        pose = self._as_pose(pose)
+        pose = self.as_pose(pose)
         check_shape("pose.angles", pose.angles, 15, 3, hint="One pose a picture.")
         check_shape("pose.orientation", pose.orientation, 3, 3)
         check_shape("pose.translation", pose.translation, 3)

@@ -44,6 +44,9 @@ fingers cross, a fit that is a little off would make a bulb of the tip behind.""
 BEYOND = 0.5
 """Distance of the outline of Gaussians, at half opacity, outside the mask's [px]. A pixel on the outline is half
 background in the photo and half black in an image over black, so what fits best is opaque there: see docs/avatar.md."""
+_OPAQUE, _OVERLAP = 0.85, 0.3
+"""Opacity below which there is a slit that the photo does not have, and how far beyond its middle each side goes [px].
+In pictures twice as fine, slits of half a pixel are white lines between fingers."""
 _ROUNDS, _RENDERED_ROUNDS = 4, 2
 _REJECT, _RENDERED_REJECT = 0.04, 4 / PRIOR_SIZE
 """Gaps beyond this are faults of the mask and ignored, as fractions of the landmarks' box and of the crop's side."""
@@ -209,14 +212,17 @@ def _compare_rendered(
     outward, start, reach = across / steepness[:, None], uv[vertex], 1.5 * reject
     drawn, shown = crossing(alpha, start, outward, reach), crossing(mask, start, outward, reach)
     gap = shown + BEYOND - drawn
-    edge = start + outward * np.nan_to_num(drawn)[:, None]
     # A slit that the photo does not have: the opacity falls and rises again where the mask stays.
-    width = np.nan_to_num(crossing(1 - alpha, edge, outward, reach))
-    slit = np.isfinite(drawn) & (width > 0)
+    thick = alpha - (_OPAQUE - 0.5)
+    thins = crossing(thick, start, outward, reach)
+    edge = start + outward * np.nan_to_num(thins)[:, None]
+    width = np.nan_to_num(crossing(1 - thick, edge, outward, reach))
+    slit = np.isfinite(thins) & (width > 0)
     for share in (0.0, 0.5, 1.0):
         x, y = np.clip(np.floor(edge + share * outward * width[:, None]).astype(int), 0, side - 1).T
         slit &= mask[y, x] > 0.5
-    gap = np.where(slit, width / 2, gap)
+    gap = np.where(slit, width / 2 + _OVERLAP, gap)
+    edge = start + outward * np.nan_to_num(np.where(slit, thins, drawn))[:, None]
     on_photo = ((edge > _BORDER) & (edge < side - _BORDER)).all(1)
     good = on_photo & (np.abs(np.nan_to_num(gap, nan=np.inf)) < reject)
     vertex, gap = vertex[good], gap[good]

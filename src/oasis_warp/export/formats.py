@@ -24,7 +24,7 @@ from oasis_warp.export.splat_formats import (
 )
 from oasis_warp.export.surface_mesh import write_obj
 from oasis_warp.export.usd import write_skinned_usd, write_splat_usd
-from oasis_warp.hand_avatar import Avatar, check_pose_type
+from oasis_warp.hand_avatar import Avatar
 from oasis_warp.ops import check_finite
 from oasis_warp.ops.checks import check_choice, check_shape
 
@@ -92,10 +92,8 @@ def export_avatar(
     writer = choose_writer(path)
     if light is not None:
         check_choice("light", light, ("baked", "none"))
-    if isinstance(pose, str):
-        pose = avatar.held(pose)
     if pose is not None:
-        check_pose_type(pose)
+        pose = avatar.as_pose(pose)
         check_shape("pose.angles", pose.angles, 15, 3, hint="One pose a file.")
         check_shape("pose.orientation", pose.orientation, 3, 3)
         check_shape("pose.translation", pose.translation, 3)
