@@ -26,8 +26,8 @@ from oasis_warp.core.types import Landmarks, Photo, Render
 from oasis_warp.data.photo import read_photo
 from oasis_warp.estimation.estimator import HandEstimator, check_sides, choose_hand
 from oasis_warp.estimation.hand_crop import crop_hand, crop_landmarks, initial_offsets
+from oasis_warp.fitted_avatar import draw_as_photo, make_avatar
 from oasis_warp.hand.skinning import hand21, rest_hand, skin
-from oasis_warp.hand_avatar import draw_as_photo, make_avatar
 from oasis_warp.losses import detail_difference, masked_psnr
 from oasis_warp.reconstruction import input_errors, reconstruct, reconstruct_same_hand
 from studies.stress import DAMAGES, DamagedInput, is_sane, likeness, make

@@ -137,7 +137,7 @@ class Avatar:
         self._made = True
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if "_made" in self.__dict__:
+        if "_made" in self.__dict__ and not name.startswith("_"):
             raise AttributeError(f"Avatar.{name}: attributes are fixed; use `with_looks` or make another Avatar.")
         super().__setattr__(name, value)
 
