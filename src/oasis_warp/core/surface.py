@@ -60,6 +60,11 @@ def smooth_over_mesh(
     """Mean of each vertex and its neighbours, `passes` times."""
     vertex, neighbour = torch.cat([edges, edges.flip(1)]).unbind(1)
     count = add_at(values.new_ones(len(values), 1), vertex, values.new_ones(len(vertex), 1))
+    if values.is_cuda:  # a gather is as repeatable as `add_at` there, and many times as fast
+        around = _members(vertex, neighbour, len(values), filler=len(values))
+        for _ in range(passes):
+            values = (values + gather_to_vertices(values, around)) / count
+        return values
     for _ in range(passes):
         values = add_at(values, vertex, values[neighbour]) / count
     return values
@@ -67,19 +72,27 @@ def smooth_over_mesh(
 
 def faces_of_vertices(faces: Int[Tensor, "F 3"], n_vertices: int) -> Int[Tensor, "V M"]:
     """The faces around each vertex, ascending; rows are filled up with F, one past the last face."""
-    order = faces.flatten().argsort(stable=True)
-    owner, face = faces.flatten()[order], order // 3
-    count = torch.bincount(owner, minlength=n_vertices)
-    place = torch.arange(len(owner), device=faces.device) - (count.cumsum(0) - count)[owner]
-    table = torch.full((n_vertices, int(count.max())), len(faces), dtype=torch.int64, device=faces.device)
-    table[owner, place] = face
+    corners = torch.arange(faces.numel(), device=faces.device)
+    return _members(faces.flatten(), corners // 3, n_vertices, filler=len(faces))
+
+
+def _members(
+    owner: Int[Tensor, "N"], member: Int[Tensor, "N"], n_owners: int, filler: int
+) -> Int[Tensor, "O M"]:
+    """The members of each owner in their order; rows are filled up."""
+    order = owner.argsort(stable=True)
+    owner, member = owner[order], member[order]
+    count = torch.bincount(owner, minlength=n_owners)
+    place = torch.arange(len(owner), device=owner.device) - (count.cumsum(0) - count)[owner]
+    table = torch.full((n_owners, int(count.max())), filler, dtype=torch.int64, device=owner.device)
+    table[owner, place] = member.long()
     return table
 
 
-def gather_to_vertices(values: Float[Tensor, "*B F D"], vertex_faces: Int[Tensor, "V M"]) -> Float[Tensor, "*B V D"]:
-    """Sum of the values of the faces around each vertex, as gathers of fixed order."""
-    padded = pad(values, (0, 0, 0, 1))  # a zero row past the last face
-    return padded[..., vertex_faces, :].sum(-2)
+def gather_to_vertices(values: Float[Tensor, "*B F D"], members: Int[Tensor, "V M"]) -> Float[Tensor, "*B V D"]:
+    """Sum of the values of what lies around each vertex, such as `faces_of_vertices`, as gathers of fixed order."""
+    padded = pad(values, (0, 0, 0, 1))  # a zero row past the last one
+    return padded[..., members, :].sum(-2)
 
 
 def gathered_normals(
