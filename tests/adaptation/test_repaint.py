@@ -17,7 +17,7 @@ from oasis_warp.avatar.observation import inner_mask
 from oasis_warp.avatar.pose import pose_gaussians, with_shade_baked
 from oasis_warp.avatar.prior import MeanPrior
 from oasis_warp.core import surface
-from oasis_warp.core.camera import orbit_camera
+from oasis_warp.core.camera import orbit_camera, project
 from oasis_warp.core.config import BLACK
 from oasis_warp.core.errors import InputError
 from oasis_warp.core.types import Camera, HandCrop, Photo
@@ -115,15 +115,22 @@ def test_learning_makes_it_likelier_and_never_leaves_the_colours(tattoo):
 
 def test_the_painted_area_is_measured_on_the_skin(truth):
     _, canvas = painted(truth)
-    depth = float(truth.avatar.mesh(truth.pose).vertices[truth.hand.segment == 0].mean(0)[2])
-    millimetre = float(canvas.camera.K[0, 0]) / depth * 1e-3
+    vertices, camera = truth.avatar.mesh(truth.pose).vertices, canvas.camera
     mask = torch.zeros_like(canvas.mask)
-    y, x = (int(v) for v in torch.nonzero(canvas.mask > 0.9).float().mean(0))
-    half = round(8 * millimetre)
+    x, y = (int(v) for v in project(camera, vertices[truth.hand.segment == 0].mean(0)[None])[0][0])
+    half = 12
     mask[y - half : y + half, x - half : x + half] = 1
     made = run(truth, canvas._replace(mask=mask), steps=0)
-    expected = (2 * half / millimetre) ** 2
-    assert 0.9 * expected < 1e6 * made.area < 1.4 * expected  # the palm is curved and a little turned
+    # At focal length f a pixel shows z^2 / (f^2 n.v) of skin at depth z with the normal n, along v = (x / z, y / z, 1).
+    faces, size = truth.hand.faces, camera.width
+    seen = depth_map(vertices, faces, camera.viewmat, camera.K, size, size, validate=False)
+    normals, _ = surface.face_normals(vertices, faces)
+    grid = torch.stack(torch.meshgrid(torch.arange(size), torch.arange(size), indexing="xy"), -1) + 0.5
+    rays = torch.cat([(grid - camera.K[:2, 2]) / camera.K.diagonal()[:2], torch.ones(size, size, 1)], -1)
+    slant = (normals[seen.face_ids.clamp_min(0).long()] * rays).sum(-1).abs()
+    areas = seen.depth**2 / (camera.K[0, 0] * camera.K[1, 1] * slant)
+    least, most = (float(areas[inner_mask(mask, pixels) > 0.5].sum()) for pixels in (2, 0))
+    assert least < made.area < most < 1.5 * least  # what lies on the border counts in part
 
 
 def test_what_another_surface_hides_gets_no_paint(truth):
