@@ -13,6 +13,7 @@ from oasis_warp.adaptation.prior_guess import Calibration, calibrate, mix_guesse
 from oasis_warp.adaptation.reliability import VertexObservations, observe_photos, photo_gains
 from oasis_warp.adaptation.sh_lighting import match_light
 from oasis_warp.adaptation.sharpen import sharpen
+from oasis_warp.adaptation.skin_tone import with_likely_tone
 from oasis_warp.adaptation.texture import Targets, learn_lora, learn_texture, make_targets, reference_azimuths
 from oasis_warp.adaptation.unlit import (
     MIN_ALPHA,
@@ -55,7 +56,7 @@ class Adaptation(NamedTuple):
 
     gaussians: CanonicalGaussians
     guess: CanonicalGaussians
-    """Before adaptation: the guesses of all photos, mixed."""
+    """Before adaptation: the guesses of all photos, in one likely tone, mixed."""
     calibration: Calibration
     losses: tuple[float, ...]
     """Loss of each step of texture learning."""
@@ -134,6 +135,8 @@ def adapt(
     """
     lora = _heads_to_train(config, heads, len(crops))
     progress("calibration", 0, 1)
+    if heads is None:  # heads that are trained give the colours anew
+        guesses = with_likely_tone(hand, guesses, crops)
     guess, photos = _gather(hand, guesses, crops, resolutions, config)
     evenly_exposed = [crop.image / gain for crop, gain in zip(photos.unlit, photos.gains, strict=True)]
     trust = [inner_mask(crop.mask, 1) * share for crop, share in zip(photos.unlit, photos.pixel_shares, strict=True)]

@@ -116,7 +116,7 @@ def paint_unseen(
     confidence = observations.confidence.amax(0)
     invented = _unseen_share(hand, confidence)
     seen = vertex_colors(gaussians, len(rest))
-    tone = infer_tone(hand, vertex_colors(guess, len(rest)), seen, confidence, crop.reading)
+    tone = infer_tone(hand, vertex_colors(guess, len(rest)), seen, confidence)
     difference = seen.clamp_min(MIN_COLOR).log() - tone.log_skin
     nail = skin_regions(hand).nail.to(rest)
     sure = ((confidence - SEEN) / (1 - SEEN)).clamp(0, 1) * (1 - nail)
