@@ -124,12 +124,12 @@ class Avatar:
         if light is not None:
             camera = mirror_camera(source_camera) if left else source_camera
             center = camera_center(camera.viewmat.to(vertices))
-            photo = self._photo_surface()
+            photo, flat = self._photo_surface(), self._flat_surface()
             corners = gaussian_corners(self.hand.faces, gaussians)
             known = with_photo(light, self.rest.vertices, photo, self.hand.faces, center)._replace(corners=corners)
             self._light = mirror_surface_light(known) if left else known
             self._folds = find_folds(self.hand, gaussians, invented, source_pose.angles.to(vertices))
-            self._creases = find_creases(self.hand, gaussians, invented, photo, self._folds)
+            self._creases = find_creases(self.hand, gaussians, invented, photo, flat, self._folds)
         self._fixed = *(part for part in self._canonical if part is not None), vertices, self._rest.joints
         self._source_angles = source_pose.angles.to(self.shape)
         self._graphs = GraphCache()
@@ -148,6 +148,11 @@ class Avatar:
         """Vertices in the photo's pose; of a left hand in the mirror, where faces wind outwards."""
         source = mirror_pose(self.source_pose) if self.side == "left" else self.source_pose
         return skin_surface(self.hand, self.rest, HandPose(*(part.to(self.shape) for part in source)))
+
+    def _flat_surface(self) -> Float[Tensor, "V 3"]:
+        """Vertices of the open hand, whose state is that of painted skin."""
+        pose = self.source_pose._replace(angles=named_pose(self.hand, "open"))
+        return skin_surface(self.hand, self.rest, HandPose(*(part.to(self.shape) for part in pose)))
 
     @property
     def gaussians(self) -> CanonicalGaussians:

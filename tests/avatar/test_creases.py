@@ -3,7 +3,7 @@ import torch
 from synthetic import as_left_hand, avatar_of, crop_of
 
 from oasis_warp.avatar.appearance import skin_regions
-from oasis_warp.avatar.creases import SHALLOW, find_creases, flat_share
+from oasis_warp.avatar.creases import SHALLOW, find_creases, stretched_share
 from oasis_warp.avatar.sky import studio_light
 from oasis_warp.core import surface
 
@@ -22,11 +22,18 @@ def creased(hand):
 
 
 def creases_of(avatar, invented=None):
-    return find_creases(avatar.hand, avatar.gaussians, invented, avatar._photo_surface(), avatar.parts.folds)
+    surfaces = avatar._photo_surface(), avatar._flat_surface()
+    return find_creases(avatar.hand, avatar.gaussians, invented, *surfaces, avatar.parts.folds)
+
+
+def without_wrinkles(creases):
+    """Those that only go flat."""
+    kept = creases.change.abs().amax(1) > 0
+    return creases._replace(index=creases.index[kept], change=creases.change[kept], wrinkles=creases.wrinkles[kept])
 
 
 def test_creases_of_the_palm_are_found_up_to_shallow_ones(hand, creased):
-    creases = creases_of(creased)
+    creases = without_wrinkles(creases_of(creased))
     dark = creased.gaussians.colors[creases.index, 0] < 0.32
     most = creases.change[dark].median()
     assert -DARK - SHALLOW - 0.12 < float(most) < -DARK - SHALLOW + 0.01
@@ -41,26 +48,26 @@ def test_ink_on_a_palm_stays(hand, creased):
     dark = creased.gaussians.colors < 0.32
     colors = torch.where(dark, 0.08, creased.gaussians.colors)
     inked = creased.with_looks(creased.gaussians._replace(colors=colors), creased.light)
-    of_lines, of_ink = (int(dark[creases_of(avatar).index, 0].sum()) for avatar in (creased, inked))
+    of_lines, of_ink = (int(dark[without_wrinkles(creases_of(avatar)).index, 0].sum()) for avatar in (creased, inked))
     assert of_lines > 100 and of_ink < of_lines / 10
 
 
 def test_skin_is_flat_where_it_is_stretched_and_as_in_the_photo_in_its_pose(creased):
     """Skin that a bent thumb had bunched was a lump of putty on an open hand."""
     creases, photo, opened = creases_of(creased), creased._photo_surface(), creased.mesh("open").vertices
-    assert float(flat_share(creases, photo).amax()) == 0
-    share = flat_share(creases, opened)
+    assert float(stretched_share(creases, photo).abs().amax()) == 0
+    share = stretched_share(creases, opened)
     before, after = (surface.vertex_areas(vertices, creased.hand.faces) for vertices in (photo, opened))
     grown = surface.smooth_over_mesh((after / before).log()[:, None], surface.mesh_edges(creased.hand.faces), 6)[:, 0]
-    assert float(share[grown > 0.35].mean()) > 0.9 and float(share[grown < -0.05].mean()) < 0.1
-    torch.testing.assert_close(flat_share(creases, torch.stack([photo, opened]))[1], share)
+    assert float(share[grown > 0.35].mean()) > 0.9 and float(share[grown < -0.05].amax()) < 0.5
+    torch.testing.assert_close(stretched_share(creases, torch.stack([photo, opened]))[1], share)
     turned = opened @ torch.tensor([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]) + 0.3
-    torch.testing.assert_close(flat_share(creases, turned), share, rtol=0, atol=1e-4)
+    torch.testing.assert_close(stretched_share(creases, turned), share, rtol=0, atol=1e-4)
 
 
 def test_painted_palms_keep_theirs(hand, creased):
     """They are those of an open hand."""
-    assert len(creases_of(creased, torch.ones(len(hand.template))).index) == 0
+    assert len(without_wrinkles(creases_of(creased, torch.ones(len(hand.template)))).index) == 0
 
 
 def test_avatars_of_both_sides_are_posed_with_flat_creases(creased):

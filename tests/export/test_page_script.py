@@ -17,7 +17,7 @@ from tests.export.page_parts import LARGEST, section
 
 from oasis_kernels import constants
 from oasis_kernels.scene import sky_exposure as kernels
-from oasis_warp.avatar import creases, folds, sky, vertex_light
+from oasis_warp.avatar import creases, folds, sky, vertex_light, wrinkles
 from oasis_warp.avatar.sky import studio_light
 from oasis_warp.core.camera import ORBIT_FIELD_OF_VIEW, orbit_camera
 from oasis_warp.export import page_data
@@ -44,7 +44,8 @@ RULES = {
         **vars_of(vertex_light, "WEAK DEEP"),
         **vars_of(sky, "IN_HOLLOWS LEAST_LIGHT IN_CREVICES DEEP_INSIDE OUTSIDE"),
         **vars_of(folds, "CLOSED OPENED"),
-        **vars_of(creases, "STRETCHED LEAST_AREA"), "UNSTRETCHED": creases.AS_IN_PHOTO,
+        **vars_of(creases, "STRETCHED LEAST_AREA LITTLE COMPRESSED"), "UNSTRETCHED": creases.AS_IN_PHOTO,
+        "WRINKLE_HUE": wrinkles.HUE,
         **vars_of(page_data, "NO_JOINT STRETCH"),
     },
     "sky.js": {

@@ -41,7 +41,8 @@ def scene(hand, device):
     mesh = sky_mesh(torch.device(device))
     creases = Creases(
         creased, rows_of(creased, N), Corners(*(part[creased] for part in corners)),
-        uniform(200, 3, low=-0.5, high=0.5), uniform(len(mesh.vertices), low=1e-5, high=3e-5),
+        uniform(200, 3, low=-0.5, high=0.5), uniform(200, 3, low=-0.5, high=0.5),
+        uniform(len(mesh.vertices), low=1e-5, high=3e-5),
     )  # fmt: skip
     posed = torch.stack([hand.template, 1.1 * hand.template]).to(device)
     of_vertices = uniform(2, n, 5)

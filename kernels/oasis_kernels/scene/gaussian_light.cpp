@@ -61,10 +61,11 @@ void light_gaussians(
                     const int m = creases[i + lane];
                     if (m < 0) continue;
                     any = true;
-                    float how_flat = 0.f;
+                    float share = 0.f;
                     for (int k = 0; k < 3; k++)
-                        how_flat += weights[3ll * (i + lane) + k] * flat[first + around[3 * lane + k]];
-                    for (int c = 0; c < 3; c++) change[c][lane] = how_flat * crease_change[3 * m + c];
+                        share += weights[3ll * (i + lane) + k] * stretched[first + around[3 * lane + k]];
+                    const float* logs = share > 0.f ? crease_change : wrinkles;
+                    for (int c = 0; c < 3; c++) change[c][lane] = wp::abs(share) * logs[3 * m + c];
                 }
                 for (int c = 0; any && c < 3; c++) color[c] *= exponential(load(change[c]));
             }

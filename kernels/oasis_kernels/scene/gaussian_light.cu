@@ -25,9 +25,10 @@ __global__ void light_gaussians(
     }
     if (shade) shaded(shade + 3ll * i, deep, weak, read);
     if (creases && creases[i] >= 0) {
-        float how_flat = 0.f;
-        for (int k = 0; k < 3; k++) how_flat += weights[3 * i + k] * flat[first + corners[3 * i + k]];
-        for (int c = 0; c < 3; c++) read[c] *= expf(how_flat * crease_change[3 * creases[i] + c]);
+        float share = 0.f;
+        for (int k = 0; k < 3; k++) share += weights[3 * i + k] * stretched[first + corners[3 * i + k]];
+        const float* logs = share > 0.f ? crease_change : wrinkles;
+        for (int c = 0; c < 3; c++) read[c] *= expf(fabsf(share) * logs[3 * creases[i] + c]);
     }
     for (int c = 0; c < 3; c++) out[3 * at + c] = fminf(fmaxf(colors[3 * i + c] * read[c], 0.f), 1.f);
 }

@@ -30,10 +30,11 @@ SHADOW, SHADOW_REACH = 0.003, 0.012
 """Where the photo may show another part of the hand: the length over which shadows are smoothed, because a fit is some
 pixels off and both sides of a dark gap are dark; and how far shadows go on behind what the photo shows [m]."""
 DARKEST_SHADOW, SHADOW_HUE = -1.2, (0.87, 1.01, 1.12)
-"""Least logarithm of such a shadow, and that of red, green and blue over it, as of skin in photos (docs/looks.md)."""
+"""Least logarithm of such a shadow, and that of red, green and blue over it: half as warm as in photos
+(docs/looks_choices.md)."""
 IN_SHADOW, IN_THE_OPEN = 0.65, 0.95
 """Shares of the sky that skin sees up to which such a shadow is kept, and from which it is not. Set by eye, as the four
-above, on 6 photos of docs/looks.md: .4 and .75 lost the shadow below a thumb."""
+above, on 6 photos (docs/looks_choices.md): .4 and .75 lost the shadow below a thumb."""
 
 
 def spread_shade(

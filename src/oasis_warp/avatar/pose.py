@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from oasis_warp.avatar.anchors import gaussian_corners
-from oasis_warp.avatar.creases import Creases, flat_creases, flat_share
+from oasis_warp.avatar.creases import Creases, crease_logs, stretched_share
 from oasis_warp.avatar.folds import Folds, Opening, open_folds, opened_by_joints
 from oasis_warp.avatar.vertex_light import (
     DEEP,
@@ -24,7 +24,7 @@ from oasis_warp.avatar.vertex_light import (
 from oasis_warp.core.types import CanonicalGaussians, Gaussians, HandLight
 from oasis_warp.ops import RestMesh, pose_mesh_gaussians
 from oasis_warp.ops.corner_reading import Corners, read_corners
-from oasis_warp.ops.gaussian_light import FlatCreases, OpenFolds, light_gaussians
+from oasis_warp.ops.gaussian_light import OpenFolds, StretchedSkin, light_gaussians
 
 MAX_DETAIL = 0.3
 """Difference of the logarithms of colours up to which detail is skin where it goes against the shade: bright beside a
@@ -42,7 +42,7 @@ MIN_COLOR = 1e-3
 
 
 class Bend(NamedTuple):
-    """What bent joints and stretched skin change in the colours of an avatar's Gaussians."""
+    """What bent joints, stretched and compressed skin change in the colours of an avatar's Gaussians."""
 
     folds: Folds
     angles: Float[Tensor, "*B J 3"]
@@ -99,12 +99,13 @@ def lit_in_steps(
 ) -> Float[Tensor, "*B N 3"]:
     """The colours of Gaussians under the `vertex_light` of the vertices around them, their `corners`.
 
-    In a `bend`, folds over bent joints are open, and creases in stretched skin of the `posed` surface are flat.
+    In a `bend`, folds over bent joints are open, creases in stretched skin of the `posed` surface are flat, and
+    compressed skin has wrinkles.
     """
     opening = None if bend is None else open_folds(bend.folds, bend.angles)
     factors = _factors(canonical, of_vertices, corners, opening)
     if bend is not None:
-        factors = _times_exp(factors, bend.creases.index, flat_creases(bend.creases, posed))
+        factors = _times_exp(factors, bend.creases.index, crease_logs(bend.creases, posed))
     return (canonical.colors * factors).clamp(0, 1)
 
 
@@ -121,8 +122,9 @@ def lit(
         own, opened = bend.folds, opened_by_joints(bend.folds, bend.angles)
         opened = opened.reshape(-1, *opened.shape[-2:])
         folds = OpenFolds(own.row, opened, own.joints, own.between, own.painted, own.change)
-        flat = flat_share(bend.creases, posed)
-        creases = FlatCreases(bend.creases.row, flat.reshape(-1, flat.shape[-1]), bend.creases.change)
+        share = stretched_share(bend.creases, posed)
+        share = share.reshape(-1, share.shape[-1])
+        creases = StretchedSkin(bend.creases.row, share, bend.creases.change, bend.creases.wrinkles)
     found = light_gaussians(
         of_vertices.reshape(-1, *of_vertices.shape[-2:]), corners, canonical.colors, canonical.shade, (WEAK, DEEP),
         folds, creases,
@@ -218,8 +220,9 @@ def pose_gaussians(
     its `rest_mesh`. If `posed_vertices` have a leading axis of poses, so have means, quats and scales. With a `light`,
     so have the colours: they are drawn in it, without the part that the posed surface hides. With the `center` of a
     camera, shade fades as that camera leaves the side of the photo; without, it is as some degrees beside the photo.
-    With a `bend`, folds over bent joints are open in that light, and creases in stretched skin flat. With the
-    `closeness` of the `posed_vertices` to other skin, little light comes between fingers that touch.
+    With a `bend`, folds over bent joints are open in that light, creases in stretched skin flat, and compressed skin
+    has wrinkles. With the `closeness` of the `posed_vertices` to other skin, little light comes between fingers that
+    touch.
     """
     means, quats, scales, vertex_quats = pose_mesh_gaussians(
         rest_vertices, posed_vertices, faces, canonical.face_index, canonical.barycentrics, canonical.vertex_index,

@@ -16,6 +16,7 @@ from oasis_warp.avatar.creases import Creases
 from oasis_warp.avatar.folds import Folds
 from oasis_warp.avatar.sky import sky_mesh, studio_light
 from oasis_warp.avatar.vertex_light import GAMMA, SurfaceLight
+from oasis_warp.avatar.wrinkles import HUE
 from oasis_warp.core import surface
 from oasis_warp.core.camera import ORBIT_FIELD_OF_VIEW, ORBIT_MARGIN
 from oasis_warp.core.errors import InputError
@@ -252,11 +253,13 @@ def _fold_arrays(folds: Folds, creases: Creases, count: int) -> dict[str, np.nda
     """Folds and creases as values of all Gaussians: these have `STRETCH` as joint, those without either `NO_JOINT`."""
     change = folds.change.new_zeros(count, 3).index_copy(0, folds.index, folds.change)
     change = change.index_copy(0, creases.index, creases.change)
+    wrinkles = creases.wrinkles.new_zeros(count, 3).index_copy(0, creases.index, creases.wrinkles)[:, 1]
     between = folds.between.new_zeros(count, 1).index_copy(0, folds.index, folds.between)
     joints = folds.joints.new_full((count, 2), NO_JOINT).index_copy(0, folds.index, folds.joints)
     joints = joints.index_fill(0, creases.index, STRETCH)
     return {
-        "folds": _pack(change, "i1"), "foldJoints": _numpy(joints, "u1"), "foldBetween": _pack(between, "u1", 1.0)
+        "folds": _pack(change, "i1"), "foldJoints": _numpy(joints, "u1"), "foldBetween": _pack(between, "u1", 1.0),
+        "wrinkles": _pack(wrinkles / HUE[1], "i1"),
     }  # fmt: skip
 
 

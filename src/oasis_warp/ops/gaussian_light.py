@@ -33,14 +33,15 @@ class OpenFolds(NamedTuple):
     change: Float[Tensor, "M 3"]
 
 
-class FlatCreases(NamedTuple):
-    """Creases at K of N Gaussians, as `avatar.creases.Creases`, in a pose; indices are int32."""
+class StretchedSkin(NamedTuple):
+    """Creases and wrinkles at K of N Gaussians, as `avatar.creases.Creases`, in a pose; indices are int32."""
 
     row: Int[Tensor, "N"]
     """Of the crease at each Gaussian, -1 for none."""
     share: Float[Tensor, "B V"]
-    """How flat creases are at vertices."""
+    """How flat creases are at vertices; below 0, how deep wrinkles are."""
     change: Float[Tensor, "K 3"]
+    wrinkles: Float[Tensor, "K 3"]
 
 
 @torch.no_grad()
@@ -51,7 +52,7 @@ def light_gaussians(
     shade: Float[Tensor, "N 3"] | None,
     bounds: tuple[float, float],
     folds: OpenFolds | None = None,
-    creases: FlatCreases | None = None,
+    creases: StretchedSkin | None = None,
 ) -> Float[Tensor, "B N 3"]:
     """The colours that `avatar.pose.lit_in_steps` describes; float32, values and indices are trusted.
 
@@ -64,19 +65,19 @@ def light_gaussians(
         shade: Of the Gaussians.
         bounds: Differences of shade from 1 up to which it is weak, and from which it is deep.
         folds: That bent joints open.
-        creases: That stretched skin flattens.
+        creases: That stretched skin flattens, and wrinkles of compressed skin.
     """
     batch, n = len(columns), len(colors)
     row, opened, joints, between, painted, fold_change = contiguous(*(folds or [None] * 6))
-    crease, flat, crease_change = contiguous(*(creases or [None] * 3))
+    crease, stretched, crease_change, wrinkles = contiguous(*(creases or [None] * 4))
     index, weights, columns, colors, shade = contiguous(*corners, columns, colors, shade)
     out = colors.new_empty(batch, n, 3)
     params = {
         "batch": batch, "n_vertices": columns.shape[1], "n": n, "n_joints": 0 if opened is None else opened.shape[1],
         "bounds": _bounds(bounds, colors.device), "columns": columns, "corners": index, "weights": weights,
         "colors": colors, "shade": shade, "folds": row, "opened": opened, "joints": joints, "between": between,
-        "painted": painted, "fold_change": fold_change, "creases": crease, "flat": flat,
-        "crease_change": crease_change, "out": out,
+        "painted": painted, "fold_change": fold_change, "creases": crease,
+        "stretched": stretched, "crease_change": crease_change, "wrinkles": wrinkles, "out": out,
     }  # fmt: skip
     if colors.is_cuda:
         run_cuda(

@@ -14,6 +14,8 @@ const IN_HOLLOWS = [1, 1.2, 1.35], LEAST_LIGHT = [0.05, 0.02, 0.01]; // of light
 const IN_CREVICES = [0.03, 0.012, 0.008], DEEP_INSIDE = 0.4, OUTSIDE = 0.6; // of light close to other skin, as there
 const CLOSED = (15 * Math.PI) / 180, OPENED = (75 * Math.PI) / 180; // flexions between which folds open, as in avatar/folds.py
 const UNSTRETCHED = 0.05, STRETCHED = 0.25; // logarithms of growth between which creases go flat, as in avatar/creases.py
+const LITTLE = 0.25, COMPRESSED = 0.85; // logarithms of shrinking between which wrinkles grow, as there
+const WRINKLE_HUE = [0.8, 1.08, 1.12]; // as in avatar/wrinkles.py // as in avatar/wrinkles.py
 const LEAST_AREA = 1e-12; // of which a logarithm is taken [m^2]
 const NO_JOINT = 255, STRETCH = 254; // of Gaussians that have no folds, and of those with creases
 const WEAK = 0.3, DEEP = 0.6; // differences of shade from 1, up to which it is the skin's own, and from which it is not
@@ -25,7 +27,7 @@ function makeShading(body, { count }) {
     normals: new Float32Array(3 * n), factors: new Float32Array(4 * n), change: new Float32Array(n), nearby: new Float32Array(n),
     deep: new Float32Array(n), colors: new Uint32Array(count), sky: makeSky(body),
     opened: new Float32Array(2 * (body.nBones - 1)), // of each joint, the share of seen folds that is open, and of painted ones
-    stretched: new Float32Array(n), // share of each vertex's creases that is flat
+    stretched: new Float32Array(n), // share of each vertex's creases that is flat; below 0, how deep its wrinkles are
   };
 }
 
@@ -40,7 +42,7 @@ function openFolds(body, { opened }, angles) {
   }
 }
 
-// How far the pose stretches skin since the photo: the growth of the coarse faces around each vertex.
+// How far the pose stretches or compresses skin: the growth of the coarse faces around each vertex.
 function flattenCreases({ posed, nVertices, data: { arrays } }, { stretched }) {
   const { skyVertices, skyFaces, skyCorners, skyShares, creaseAreas } = arrays, areas = new Float64Array(skyVertices.length);
   const point = (v) => posed.subarray(3 * skyVertices[v], 3 * skyVertices[v] + 3);
@@ -53,7 +55,7 @@ function flattenCreases({ posed, nVertices, data: { arrays } }, { stretched }) {
   for (let v = 0; v < nVertices; v++) {
     let grown = 0;
     for (let k = 3 * v; k < 3 * v + 3; k++) grown += skyShares[k] * Math.log(Math.max(areas[skyCorners[k]], LEAST_AREA) / creaseAreas[skyCorners[k]]);
-    stretched[v] = between(grown, UNSTRETCHED, STRETCHED);
+    stretched[v] = between(grown, UNSTRETCHED, STRETCHED) - between(-grown, LITTLE, COMPRESSED);
   }
 }
 
@@ -130,7 +132,7 @@ function lightVertex({ harmonics: h, limits }, bounce, x, y, z, exposure, closen
 
 // Colours and opacities of all Gaussians, a byte each, into shading.colors. `light` is null for even light.
 function colorGaussians(body, gaussians, shading, light) {
-  const { colors: own, fineShade, even, folds, foldJoints, foldBetween, invented } = body.data.arrays;
+  const { colors: own, fineShade, even, folds, foldJoints, foldBetween, wrinkles, invented } = body.data.arrays;
   const { count, corners, shares, heaviest, shown, opacities } = gaussians;
   const { factors, colors, deep, opened, stretched } = shading;
   for (let i = 0; i < count; i++) {
@@ -138,9 +140,10 @@ function colorGaussians(body, gaussians, shading, light) {
     const a = 3 * i, p = shares[a], q = shares[a + 1], r = shares[a + 2];
     const u = 4 * corners[a], v = 4 * corners[a + 1], w = 4 * corners[a + 2];
     const weak = light ? p * factors[u + 3] + q * factors[v + 3] + r * factors[w + 3] : 1;
-    let stays = 0, open = 0, seenOpen = 0;
+    let stays = 0, open = 0, seenOpen = 0, wrinkled = 0;
     if (light && foldJoints[2 * i] === STRETCH) {
-      open = p * stretched[corners[a]] + q * stretched[corners[a + 1]] + r * stretched[corners[a + 2]];
+      const share = p * stretched[corners[a]] + q * stretched[corners[a + 1]] + r * stretched[corners[a + 2]];
+      open = Math.max(share, 0), wrinkled = Math.max(-share, 0);
     } else if (light && foldJoints[2 * i] < NO_JOINT) {
       const painted = invented ? p * invented[corners[a]] + q * invented[corners[a + 1]] + r * invented[corners[a + 2]] : 0;
       const j = 2 * foldJoints[2 * i], k = 2 * foldJoints[2 * i + 1], t = foldBetween[i];
@@ -160,6 +163,7 @@ function colorGaussians(body, gaussians, shading, light) {
         factor = p * factors[u + c] + q * factors[v + c] + r * factors[w + c];
         if (stays) factor *= 1 + stays * (fineShade[a + c] - 1);
         if (open) factor *= Math.exp(open * folds[a + c]);
+        if (wrinkled) factor *= Math.exp(wrinkled * wrinkles[i] * WRINKLE_HUE[c]);
       }
       packed |= Math.round(255 * Math.min(Math.max(own[a + c] * factor, 0), 1)) << (8 * c);
     }
