@@ -193,8 +193,8 @@ class HandLight(NamedTuple):
     albedo: Float[Tensor, "3"] | None = None
     """Mean reflectance of the skin, from which light bounces into the hollows of the hand. None: nothing is hidden."""
     doubt: Float[Tensor, "V"] | None = None
-    """How far that photo may show something else there, 0 to 1: all shade ends there when the sky nearby opens, and that
-    of the Gaussians in next to any other view."""
+    """How far that photo may show something else there, 0 to 1: all shade ends there when the sky nearby opens, and
+    that of the Gaussians in next to any other view."""
 
 
 class TrainingBatch(NamedTuple):
