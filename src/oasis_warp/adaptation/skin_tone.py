@@ -28,13 +28,14 @@ KNUCKLE_MELANIN = 0.15
 """How much more melanin knuckles have."""
 SURE_PLACE, FEWEST = 0.006, 200
 """Spread of a place up to which a network's albedo there counts [m], and fewest such pixels."""
-SIGMA_TONE = 0.4
-"""Width of the Cauchy distribution of the error of each network's logarithm of melanin. It is .5 in the root mean
-square on 54 synthetic photos, but up to 2.5 on photos of light hands in dim light."""
-SIGMA_BRIGHTER, BRIGHTER_NOISE = 0.14, 0.0005
-"""Standard deviation of how much brighter palms are than backs in a photo, as a logarithm, and the variance of shading
-that adds to it over the variance of palm that shading does not explain. From the same synthetic photos, and from 24 of
-light hands in same_hand."""
+SIGMA_TONE, FREEDOM = 0.2, 3
+"""Scale and degrees of freedom of Student's t distribution of the error of each network's logarithm of melanin. That
+is .5 in the root mean square on 54 synthetic photos, but up to 2.5 on photos of light hands in dim light. With heavier
+tails (.4 and 1) the mean leaned to the middle of all tones, by .2 dB on synthetic people in even light."""
+SIGMA_BRIGHTER, BRIGHTER_NOISE = 0.12, 0.0005
+"""Standard deviation of how much brighter palms are than backs in a photo, as a logarithm: .08 on those synthetic
+photos, .15 on 24 of light hands in same_hand. And the variance of shading that adds to its square, over the variance of
+palm that shading does not explain."""
 SHADING_RIDGE = 0.03
 """Weight of the gradient of shading along the normal, against the mean square of the logarithms' error."""
 MIN_COLOURFUL = 0.4
@@ -82,7 +83,8 @@ def with_likely_tone(
         read = None if crop.reading is None else _melanin_read(table, tones, crop.reading, bare)
         for told in (own[-1], read):
             if told is not None:
-                cost = cost + 2 * torch.log1p(((tones - told) / SIGMA_TONE).square())
+                apart = ((tones - told) / SIGMA_TONE).square()
+                cost = cost + (FREEDOM + 1) * torch.log1p(apart / FREEDOM)
         shown, variance = _palm_over_back(hand, crop)
         cost = cost + (shown - _brighter_palms(table, bare)).square() / variance
     likely = torch.softmax(-cost / 2, 0) @ tones
