@@ -3,13 +3,14 @@
     python asset_build/build_wrinkles.py --out src/oasis_warp/assets/hand/wrinkles.npz
 
 Wrinkles run across the direction in which skin is compressed. That direction is the mean over `POSES` of the mean hand.
-Wrinkles lie where a phase is whole: its gradient fits that direction in the least squares, over the distance between
-wrinkles (Botsch et al., Polygon Mesh Processing, 2010, for gradients on meshes).
+Wrinkles lie where a phase is a whole number. Its gradient is that direction over the distance between wrinkles, in the
+least squares.
 """
 
 import argparse
 from pathlib import Path
 
+import igl
 import numpy as np
 import scipy.sparse as sp
 import torch
@@ -32,7 +33,7 @@ DIRECTION_PASSES = 80
 """Smoothings over the mesh of the direction of compression, about 18 mm."""
 SPACING, WANDER = (0.0058, 0.0019), (0.7, 0.35)
 """Distances between wide and fine wrinkles on the open hand [m], and how far they wander [distances]."""
-WANDER_PASSES, VARIETY_PASSES = 60, (25, 25)
+WANDER_PASSES, VARIETY_PASSES = 60, 25
 """Smoothings of the noise by which they wander, and of that by which their depth varies along them."""
 DEPTH, VARIETY, DEEPEST = 0.5, 0.6, 1.5
 """Mean depth, its standard deviation, and its limit."""
@@ -40,6 +41,8 @@ STILL, MOVING = 0.4, 0.9
 """Sum of the logarithms of compression over the poses up to which skin has no wrinkles, and from which it has all."""
 CALM = 0.02
 """Weight of the direction where nothing compresses the skin."""
+LEVEL = 1e-9
+"""Weight of values of 0, which a gradient does not tell from others."""
 SEED = 3
 
 
@@ -56,10 +59,10 @@ def wrinkles(hand: HandModel) -> dict[str, np.ndarray]:
     direction, pressed = compression(hand, flat)
     across = torch.where(direction[:, 2:] < 0, -direction, direction)  # one way over the whole palm
     phases, depths = [], []
-    for k, (spacing, wander, passes) in enumerate(zip(SPACING, WANDER, VARIETY_PASSES, strict=True)):
+    for k, (spacing, wander) in enumerate(zip(SPACING, WANDER, strict=True)):
         phase = potential(flat, faces, across / spacing, pressed + CALM)
         phases.append(phase + wander * noise(hand, SEED + 10 * k, WANDER_PASSES))
-        depths.append((DEPTH + VARIETY * noise(hand, SEED + 10 * k + 1, passes)).clamp(0, DEEPEST))
+        depths.append((DEPTH + VARIETY * noise(hand, SEED + 10 * k + 1, VARIETY_PASSES)).clamp(0, DEEPEST))
     of_vertices = spread(hand, pressed[:, None])[:, 0]
     moving = ((of_vertices - STILL) / (MOVING - STILL)).clamp(0, 1) * (1 - hand.nail.clamp(0, 1))
     return {
@@ -101,26 +104,19 @@ def least_stretch(before: Tensor, after: Tensor) -> tuple[Tensor, Tensor]:
 
 def spread(hand: HandModel, of_faces: Tensor) -> Tensor:
     """Means at the vertices of values of the faces around them."""
-    faces, count = hand.faces.long(), len(hand.template)
-    both = torch.cat([of_faces, torch.ones(len(faces), 1)], 1)
-    summed = torch.zeros(count, both.shape[1]).index_add_(0, faces.reshape(-1), both.repeat_interleave(3, 0))
-    return summed[:, :-1] / summed[:, -1:]
+    mesh = hand.template.double().numpy(), hand.faces.numpy()
+    means = [igl.average_onto_vertices(*mesh, np.ascontiguousarray(values)) for values in of_faces.double().numpy().T]
+    return torch.from_numpy(np.stack(means, 1)).float()
 
 
 def potential(vertices: Tensor, faces: Tensor, gradient: Tensor, weight: Tensor) -> Tensor:
-    """Values of vertices whose gradient along the faces is nearest to `gradient`."""
-    p, q, r = vertices.double()[faces].unbind(1)
-    normal = torch.linalg.cross(q - p, r - p)
-    double_area = normal.norm(dim=1, keepdim=True)
-    hats = [torch.linalg.cross(normal / double_area, side) / double_area for side in (r - q, p - r, q - p)]
-    rows = torch.arange(3 * len(faces)).view(-1, 3)
-    values = torch.stack(hats, 2).reshape(-1)
-    place = (rows[:, :, None].expand(-1, -1, 3).reshape(-1), faces[:, None].expand(-1, 3, -1).reshape(-1))
-    operator = sp.csr_matrix((values.numpy(), [part.numpy() for part in place]))
-    share = np.repeat((double_area[:, 0] * weight).numpy(), 3)
+    """Values of vertices whose gradient along the faces is nearest to `gradient`; `weight` is that of each face."""
+    points, corners = vertices.double().numpy(), faces.numpy()
+    operator = igl.grad(points, corners)  # three blocks of rows: along x, y and z
+    share = np.tile(igl.doublearea(points, corners) * weight.numpy(), 3)
     system = operator.T @ sp.diags(share) @ operator
-    system += sp.eye(system.shape[0]) * 1e-9 * system.diagonal().mean()
-    found = spsolve(system.tocsc(), operator.T @ (share * gradient.double().numpy().reshape(-1)))
+    system += sp.eye(system.shape[0]) * LEVEL * system.diagonal().mean()
+    found = spsolve(system.tocsc(), operator.T @ (share * gradient.T.double().numpy().reshape(-1)))
     return torch.from_numpy(found).float()
 
 

@@ -124,7 +124,8 @@ class Avatar:
         if light is not None:
             camera = mirror_camera(source_camera) if left else source_camera
             center = camera_center(camera.viewmat.to(vertices))
-            photo, flat = self._photo_surface(), self._flat_surface()
+            photo = self._photo_surface()
+            flat = self._surface_in(source_pose._replace(angles=named_pose(self.hand, "open")))  # as painted skin is
             corners = gaussian_corners(self.hand.faces, gaussians)
             known = with_photo(light, self.rest.vertices, photo, self.hand.faces, center)._replace(corners=corners)
             self._light = mirror_surface_light(known) if left else known
@@ -147,11 +148,10 @@ class Avatar:
     def _photo_surface(self) -> Float[Tensor, "V 3"]:
         """Vertices in the photo's pose; of a left hand in the mirror, where faces wind outwards."""
         source = mirror_pose(self.source_pose) if self.side == "left" else self.source_pose
-        return skin_surface(self.hand, self.rest, HandPose(*(part.to(self.shape) for part in source)))
+        return self._surface_in(source)
 
-    def _flat_surface(self) -> Float[Tensor, "V 3"]:
-        """Vertices of the open hand, whose state is that of painted skin."""
-        pose = self.source_pose._replace(angles=named_pose(self.hand, "open"))
+    def _surface_in(self, pose: HandPose) -> Float[Tensor, "V 3"]:
+        """Vertices of the right-handed surface in a pose, without contact."""
         return skin_surface(self.hand, self.rest, HandPose(*(part.to(self.shape) for part in pose)))
 
     @property

@@ -22,8 +22,8 @@ def creased(hand):
 
 
 def creases_of(avatar, invented=None):
-    surfaces = avatar._photo_surface(), avatar._flat_surface()
-    return find_creases(avatar.hand, avatar.gaussians, invented, *surfaces, avatar.parts.folds)
+    flat = avatar._surface_in(avatar.held("open"))
+    return find_creases(avatar.hand, avatar.gaussians, invented, avatar._photo_surface(), flat, avatar.parts.folds)
 
 
 def without_wrinkles(creases):
@@ -59,7 +59,7 @@ def test_skin_is_flat_where_it_is_stretched_and_as_in_the_photo_in_its_pose(crea
     share = stretched_share(creases, opened)
     before, after = (surface.vertex_areas(vertices, creased.hand.faces) for vertices in (photo, opened))
     grown = surface.smooth_over_mesh((after / before).log()[:, None], surface.mesh_edges(creased.hand.faces), 6)[:, 0]
-    assert float(share[grown > 0.35].mean()) > 0.9 and float(share[grown < -0.05].amax()) < 0.5
+    assert float(share[grown > 0.35].mean()) > 0.9 and float(share[grown < -0.05].clamp_min(0).mean()) < 0.1
     torch.testing.assert_close(stretched_share(creases, torch.stack([photo, opened]))[1], share)
     turned = opened @ torch.tensor([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]) + 0.3
     torch.testing.assert_close(stretched_share(creases, turned), share, rtol=0, atol=1e-4)

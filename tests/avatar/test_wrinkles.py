@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from synthetic import as_left_hand, avatar_of, crop_of
+from synthetic import as_left_hand, avatar_of, crop_of, with_invented
 from torch.nn.functional import normalize
 
 from oasis_warp.avatar.appearance import skin_regions
@@ -48,9 +48,7 @@ def test_painted_skin_has_them_even_in_the_photos_pose(hand):
     crop, truth, source = crop_of(hand, torch.full_like(hand.template, 0.5), size=48, pose_name="fist")
     seen = avatar_of(hand, truth, source, crop.camera, None).in_light(studio_light())
     assert float(logs_of_wrinkles(seen, source).abs().max()) < 1e-6
-    painted = seen.with_looks(seen.gaussians, seen.light)
-    painted.__dict__["invented"] = torch.ones(len(hand.template))
-    painted = painted.with_looks(painted.gaussians, painted.light)
+    painted = with_invented(seen, torch.ones(len(hand.template)))
     assert float(logs_of_wrinkles(painted, source)[:, 1].min()) < -0.1
 
 

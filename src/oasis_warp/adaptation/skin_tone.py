@@ -31,7 +31,7 @@ SURE_PLACE, FEWEST = 0.006, 200
 SIGMA_TONE, FREEDOM = 0.2, 3
 """Scale and degrees of freedom of Student's t distribution of the error of each network's logarithm of melanin. That
 is .5 in the root mean square on 54 synthetic photos, but up to 2.5 on photos of light hands in dim light. With heavier
-tails (.4 and 1) the mean leaned to the middle of all tones, by .2 dB on synthetic people in even light."""
+tails (.4 and 1) the mean leaned to the middle of all tones, which cost .5 dB on synthetic people in even light."""
 SIGMA_BRIGHTER, BRIGHTER_NOISE = 0.12, 0.0005
 """Standard deviation of how much brighter palms are than backs in a photo, as a logarithm: .08 on those synthetic
 photos, .15 on 24 of light hands in same_hand. And the variance of shading that adds to its square, over the variance of
@@ -77,6 +77,7 @@ def with_likely_tone(
     (table, nails), tones = (part.to(like) for part in _tone_table()), _log_tones(like)
     nail = skin_regions(hand).nail.to(like)
     bare, cost, own = 1 - nail, torch.zeros_like(tones), []
+    brighter = _brighter_palms(table, bare)
     for guess, crop in zip(guesses, crops, strict=True):
         colors = vertex_colors(guess, len(hand.template)).clamp_min(MIN_COLOR).log()
         own.append(_log_melanin(table, tones, colors, bare / bare.sum()))
@@ -86,7 +87,7 @@ def with_likely_tone(
                 apart = ((tones - told) / SIGMA_TONE).square()
                 cost = cost + (FREEDOM + 1) * torch.log1p(apart / FREEDOM)
         shown, variance = _palm_over_back(hand, crop)
-        cost = cost + (shown - _brighter_palms(table, bare)).square() / variance
+        cost = cost + (shown - brighter).square() / variance
     likely = torch.softmax(-cost / 2, 0) @ tones
 
     def in_tone(guess: CanonicalGaussians, of_guess: Tensor) -> CanonicalGaussians:
@@ -117,8 +118,7 @@ def _palm_over_back(hand: HandModel, crop: HandCrop) -> tuple[Tensor, Tensor]:
 def _brighter_palms(table: Float[Tensor, "T V 3"], bare: Float[Tensor, "V"]) -> Float[Tensor, "T"]:
     """Logarithms of the palm's brightness over the back's, for every tone."""
     palm = skin_regions(bundled_hand()).palm.to(bare)
-    sides = ((share / share.sum()) for share in (palm * bare, (1 - palm) * bare))
-    of_palm, of_back = (table.mean(2) @ share for share in sides)
+    of_palm, of_back = (table.mean(2) @ share / share.sum() for share in (palm * bare, (1 - palm) * bare))
     return of_palm - of_back
 
 

@@ -1,7 +1,7 @@
 """Creases of a palm that the photo shows go flat where a pose stretches skin, and compressed skin has wrinkles.
 
 A bent thumb bunches the skin of its ball, and bent fingers fold the palm. Kept on an open hand, these lumps looked like
-scars; and without them, a fist made of an open hand looked like rubber.
+scars. A fist that was made of an open hand had none, and looked like rubber.
 """
 
 import functools

@@ -21,9 +21,9 @@ WIDTH = (0.12, 0.2)
 RIDGE, RIDGE_WIDTH = 0.3, 0.3
 """How much brighter the skin midway between them is, over a wrinkle's depth, and the width of that."""
 LEAST_DEPTH, MORE, UNEVEN = 0.15, 1.3, 2.0
-"""Depth of a wrinkle is the first and up to the second more: this times a random number to the power of the third."""
+"""The depth of each wrinkle is LEAST_DEPTH + MORE * u ** UNEVEN, with a random u between 0 and 1."""
 NARROWEST, WIDER = 0.7, 0.8
-"""The same for its width."""
+"""Its width is NARROWEST + WIDER * u times `WIDTH`."""
 HUE = (0.8, 1.08, 1.12)
 """Wrinkles are redder than skin, as shade is (docs/looks_choices.md)."""
 NUMBERED, SEED = 512, 7
@@ -33,7 +33,7 @@ NUMBERED, SEED = 512, 7
 def wrinkle_logs(hand: HandModel, gaussians: CanonicalGaussians) -> Float[Tensor, "N 3"]:
     """What is added to the logarithms of the Gaussians' colours where their skin is wholly compressed.
 
-    Wrinkles lie where the phase at their place is whole (asset_build/build_wrinkles.py).
+    Wrinkles lie where the phase of their place is a whole number (asset_build/build_wrinkles.py).
     """
     phase, depth = (part.to(gaussians.colors) for part in _wrinkles())
     read = vertex_to_gaussians(torch.cat([phase, depth]).T, hand.faces, gaussians)
